@@ -1,0 +1,132 @@
+"""Matching criteria: which columns explain a sampled patch, and the Gauss-Newton step that follows.
+
+A template of N pixels is a vector t with steepest-descent images G (3 x N: its gradient times eq. 8 at theta = 0). A
+criterion names the columns R that a sampled patch g is fitted with; ``reference.prepare`` turns them into one constant
+matrix K, and the step is a simple function of K g.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch_ecc.reference import Reference
+
+ILLUMINATION = {"gain": 0, "linear": 2, "quadratic": 5}  # columns beside t itself
+
+
+class Fit(NamedTuple):
+    """What a criterion's model leaves of sampled patches: ``residual`` (B, N) and the patch's ``gain`` (B,)."""
+
+    residual: Tensor
+    gain: Tensor
+
+
+class Criterion(Protocol):
+    """What the solver asks of a matching criterion; B templates, N pixels, p columns of which the first 3 are G."""
+
+    def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
+        """R (B, p, N) from ``signal`` = [G, t] (B, 4, N) and pixel positions ``uv`` (B, 2, N) scaled to [-1, 1]."""
+        ...
+
+    def step(self, reference: Reference, g: Tensor) -> Tensor:
+        """The increment (B, 3) that the sampled patches ``g`` (B, N) ask for; non-finite if they ask for none."""
+        ...
+
+    def fit(self, reference: Reference, g: Tensor) -> Fit:
+        """Residual and gain of the sampled patches ``g`` (B, N) under the criterion's model."""
+        ...
+
+
+@dataclass(frozen=True)
+class ECC:
+    """Enhanced correlation coefficient (eq. 4) with the exact step of its linearised form.
+
+    g = a t + b^T G + c 1 (+ light columns) is fitted and the increment is b / a: the step of Evangelidis and Psarakis
+    with the roles of template and image exchanged. ``illumination``: "gain" is the paper's ECC (one gain, one offset);
+    "linear" lets the gain vary linearly over the template (columns t x', t y'), "quadratic" adds their squares and
+    product. More columns cost no time per iteration and some variance on weak templates.
+    """
+
+    illumination: str = "linear"
+
+    def __post_init__(self) -> None:
+        if self.illumination not in ILLUMINATION:
+            raise ValueError(f"illumination: expected one of {list(ILLUMINATION)}, got {self.illumination!r}")
+
+    def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
+        """[G, t, 1, t u, t v, t u^2, t v^2, t u v], as many as ``illumination`` asks for: (B, 5 + 0 | 2 | 5, N)."""
+        u, v = uv[:, :1], uv[:, 1:]
+        light = (u, v, u * u, v * v, u * v)[: ILLUMINATION[self.illumination]]
+        t = signal[:, 3:]
+        return torch.cat((signal, torch.ones_like(t), *(t * f for f in light)), 1)
+
+    def step(self, reference: Reference, g: Tensor) -> Tensor:
+        """b / a, (B, 3); infinite or NaN where the gain a is not positive."""
+        u = (reference.K[:, :4] @ g[:, :, None])[:, :, 0]
+        return u[:, :3] / u[:, 3:].clamp(min=0)
+
+    def fit(self, reference: Reference, g: Tensor) -> Fit:
+        """g minus all columns; the gain is the coefficient a of t."""
+        u = reference.K @ g[:, :, None]
+        R = self.columns(reference.signal, reference.uv)
+        return Fit(g - (u.mT @ R)[:, 0], u[:, 3, 0])
+
+
+@dataclass(frozen=True)
+class PaperECC:
+    """Eq. (9) to the letter: J not projected off the template and the constant, light as one gain and one offset."""
+
+    def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
+        """J, (B, 3, N)."""
+        return signal[:, :3]
+
+    def step(self, reference: Reference, g: Tensor) -> Tensor:
+        """(J^T J)^-1 J^T [ (dh / dg) (g - mean g) - (h - mean h) ], (B, 3): the sign of J's own increment."""
+        residual, gain = self.fit(reference, g)
+        return (reference.K @ residual[:, :, None])[:, :, 0] / gain[:, None]
+
+    def fit(self, reference: Reference, g: Tensor) -> Fit:
+        """(g - mean g) - (dg / dh) (h - mean h), and dg / dh."""
+        h0, dh = centred(reference.signal[:, 3], reference.weight)
+        g0, dg = centred(g, reference.weight)
+        gain = dg / dh
+        return Fit(g0 - gain[:, None] * h0, gain)
+
+
+@dataclass(frozen=True)
+class SSD:
+    """Sum of squared differences, the baseline: no gain and no offset."""
+
+    def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
+        """G, (B, 3, N)."""
+        return signal[:, :3]
+
+    def step(self, reference: Reference, g: Tensor) -> Tensor:
+        """pinv(G) (g - t), (B, 3)."""
+        return (reference.K @ (g - reference.signal[:, 3])[:, :, None])[:, :, 0]
+
+    def fit(self, reference: Reference, g: Tensor) -> Fit:
+        """g - t; the gain is 1."""
+        return Fit(g - reference.signal[:, 3], torch.ones_like(g[:, 0]))
+
+
+def centred(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """``values`` (B, N) minus their weighted mean, and the weighted norm (B,) of the rest."""
+    mean = (values * weight).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-30)
+    rest = values - mean
+    return rest, (rest * rest * weight).sum(-1).sqrt()
+
+
+def make_criterion(criterion: str | Criterion, illumination: str = "linear") -> Criterion:
+    """The criterion of a name ("ecc", "ecc_paper" or "ssd"), or the object itself."""
+    if not isinstance(criterion, str):
+        return criterion
+    known: dict[str, Criterion] = {"ecc": ECC(illumination), "ecc_paper": PaperECC(), "ssd": SSD()}
+    if criterion not in known:
+        raise ValueError(f"criterion: expected one of {list(known)} or an object, got {criterion!r}")
+    return known[criterion]

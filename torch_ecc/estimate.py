@@ -1,0 +1,84 @@
+"""What an alignment returns: one record per frame, one per sequence, and what its status codes mean."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Status(IntEnum):
+    """Outcome per template. The first two carry a new pose; the others keep the last good one."""
+
+    CONVERGED = 0
+    MAX_ITERATIONS = 1
+    LOST = 2
+    OUT_OF_VIEW = 3
+    LOW_TEXTURE = 4
+
+    @staticmethod
+    def describe(code: int) -> str:
+        """A sentence for people."""
+        return _SENTENCES[Status(int(code))]
+
+    @staticmethod
+    def good(status: Tensor) -> Tensor:
+        """Which elements of a status tensor carry a new pose: bool, same shape."""
+        return status <= Status.MAX_ITERATIONS
+
+
+_SENTENCES = {
+    Status.CONVERGED: "The pose is good to the requested tolerance.",
+    Status.MAX_ITERATIONS: "The pose was still moving by more than the tolerance when the iterations ran out.",
+    Status.LOST: "The frame does not look like the template near the expected place; the last good pose is kept.",
+    Status.OUT_OF_VIEW: "Too little of the template lies inside the frame; the last good pose is kept.",
+    Status.LOW_TEXTURE: "The template has too little texture for its noise to fix x, y and theta; choose another patch.",
+}
+
+
+class Estimate(NamedTuple):
+    """Poses of R templates in one frame (or B pairs).
+
+    ``pose`` (R, 3) px, px, rad; ``displacement`` (R, 3) pose minus the pose at start, theta unwrapped; ``score`` (R,)
+    zero-mean normalised correlation in [-1, 1]; ``status`` (R,) int8, see Status; ``iterations`` (R,);
+    ``covariance`` (R, 3, 3) of the pose, infinite on the diagonal where the status is a failure; ``residual_rms``
+    (R,) in grey levels of the frame.
+    """
+
+    pose: Tensor
+    displacement: Tensor
+    score: Tensor
+    status: Tensor
+    iterations: Tensor
+    covariance: Tensor
+    residual_rms: Tensor
+
+    @property
+    def sigma(self) -> Tensor:
+        """Standard deviations of the pose: (R, 3) px, px, rad."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+
+class Track(NamedTuple):
+    """The fields of Estimate stacked over F frames: (F, R, ...)."""
+
+    pose: Tensor
+    displacement: Tensor
+    score: Tensor
+    status: Tensor
+    iterations: Tensor
+    covariance: Tensor
+    residual_rms: Tensor
+
+    @property
+    def sigma(self) -> Tensor:
+        """Standard deviations of the poses: (F, R, 3) px, px, rad."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+    @staticmethod
+    def stack(estimates: Sequence[Estimate]) -> Track:
+        """One record of many; ``estimates`` must not be empty."""
+        return Track(*(torch.stack(values) for values in zip(*estimates, strict=True)))

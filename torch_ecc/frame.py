@@ -1,0 +1,71 @@
+"""The door for images: every frame, template and mask enters the package through these functions."""
+
+from __future__ import annotations
+
+import torch
+from kornia.color import rgb_to_grayscale
+from torch import Tensor
+
+PIXEL_DTYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+
+
+def require_tensor(where: str, name: str, value: object) -> Tensor:
+    """``value`` itself if it is a tensor; a ValueError that says how to make one otherwise."""
+    if not isinstance(value, Tensor):
+        kind = f"{type(value).__module__}.{type(value).__qualname__}"
+        raise ValueError(f"{where}: {name} must be a torch tensor, got {kind} (torch.from_numpy makes one)")
+    return value
+
+
+def as_gray(where: str, name: str, image: object, device: torch.device | str | None = None) -> Tensor:
+    """One or many images as float32 grey levels (B, 1, H, W) on ``device``; the numbers keep the frame's own scale.
+
+    ``image``: (H, W), (C, H, W) or (B, C, H, W) of uint8, uint16 or float, C = 1 (grey), 3 (RGB) or 4 (RGBA; the
+    alpha is dropped). Raises ValueError for any other shape or dtype, for an empty image and for NaN or infinity.
+    """
+    image = require_tensor(where, name, image)
+    shape = tuple(image.shape)
+    if image.dim() not in (2, 3, 4):
+        raise ValueError(f"{where}: {name} must be (H, W), (C, H, W) or (B, C, H, W), got {shape}")
+    if image.dtype not in PIXEL_DTYPES:
+        raise ValueError(f"{where}: {name} must be uint8, uint16 or float, got {image.dtype}")
+    if image.numel() == 0:
+        raise ValueError(f"{where}: {name} must hold pixels, got the empty shape {shape}")
+    image = image[(None,) * (4 - image.dim())]
+    if image.shape[1] not in (1, 3, 4):
+        hint = " (channels last? use permute(2, 0, 1))" if shape[-1] in (1, 3, 4) else ""
+        raise ValueError(f"{where}: {name} must have 1, 3 or 4 channels, got {shape}{hint}")
+    gray = image.to(device=device, dtype=torch.float32)
+    # The sum is finite exactly when all pixels are (no frame is large enough to overflow a float32 sum of grey
+    # levels), and costs a thirtieth of isfinite().all().
+    if image.is_floating_point() and not gray.sum().isfinite():
+        raise ValueError(f"{where}: {name} must be finite, got {_describe_nonfinite(gray)}")
+    return rgb_to_grayscale(gray[:, :3]) if gray.shape[1] > 1 else gray
+
+
+def _describe_nonfinite(image: Tensor) -> str:
+    bad = ~image.isfinite()
+    if not bad.any():
+        return "values so large that their sum overflows float32"
+    *_, row, column = bad.nonzero()[0].tolist()
+    return f"{int(bad.sum())} NaN or infinite values, the first at row {row}, column {column}"
+
+
+def as_mask(where: str, mask: object, batch: int, size: tuple[int, int]) -> Tensor:
+    """Weights (B, 1, h, w), float32, of a mask (h, w), (B, h, w) or (B, 1, h, w) of bool or numbers >= 0."""
+    mask = require_tensor(where, "mask", mask)
+    shape = tuple(mask.shape)
+    if shape not in {size, (batch, *size), (batch, 1, *size)}:
+        expected = f"{size}, {(batch, *size)} or {(batch, 1, *size)}"
+        raise ValueError(f"{where}: mask must be {expected}, got {shape}")
+    weight = mask.to(torch.float32).reshape(-1, 1, *size).expand(batch, 1, *size)
+    if not (weight.isfinite() & (weight >= 0)).all():
+        raise ValueError(f"{where}: mask must hold finite weights >= 0, got {_range(weight)}")
+    empty = (weight.amax((1, 2, 3)) == 0).nonzero().flatten().tolist()
+    if empty:
+        raise ValueError(f"{where}: mask must keep at least one pixel of each template, got none for {empty}")
+    return weight
+
+
+def _range(values: Tensor) -> str:
+    return f"values from {values.min():g} to {values.max():g}"

@@ -1,0 +1,88 @@
+"""Judge the outcome of a solve: score, residual, covariance and status per template."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_ecc.criteria import centred
+from torch_ecc.estimate import Estimate, Status
+from torch_ecc.pose import rotation
+from torch_ecc.reference import Reference, reweigh, safe_inverse
+from torch_ecc.sampling import inside
+from torch_ecc.solver import Settings, State, warps
+
+LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
+NOISE_SHARE = 0.9  # at most so much of the information in any direction may be the template's own noise
+
+
+def judge(reference: Reference, size: tuple[int, int], state: State, start: Tensor, settings: Settings) -> Estimate:
+    """The record of B solved templates in a frame of ``size`` (h, w); failed ones get their ``start`` (B, 3) back."""
+    pose = state.pose
+    seen = inside(warps(reference, pose), reference.pixels, size)
+    visible = (reference.weight * seen).sum(-1) / reference.weight.sum(-1)
+    if not bool(seen.all()):
+        reference = reweigh(reference, seen)
+    weight = reference.weight
+    residual, gain = (v.to(pose.dtype) for v in reference.criterion.fit(reference, state.patch))
+    power = (weight * residual * residual).sum(-1) / weight.sum(-1).clamp(min=1e-30)
+    score = correlation(reference.signal[:, 3], state.patch, weight).to(pose.dtype)
+    covariance, fixed = pose_covariance(reference, power, gain, pose)
+    weak = ~information(reference, reference.noise.to(pose.dtype) ** 2)[1]
+    lost = ~((score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1))
+    status = torch.full_like(score, Status.CONVERGED, dtype=torch.int8)
+    for code, found in (  # from the least to the most telling
+        (Status.MAX_ITERATIONS, state.error > settings.tolerance),
+        (Status.LOW_TEXTURE, ~fixed),
+        (Status.LOST, lost),
+        (Status.LOW_TEXTURE, lost & weak),
+        (Status.OUT_OF_VIEW, ~(visible >= settings.min_visible)),
+    ):
+        status = torch.where(found, torch.full_like(status, code), status)
+    good = Status.good(status)
+    pose = torch.where(good[:, None], pose, start)
+    unknown = torch.full_like(pose, float("inf")).diag_embed()
+    covariance = torch.where(good[:, None, None], covariance, unknown)
+    return Estimate(pose, pose - start, score, status, state.iterations, covariance, power.sqrt())
+
+
+def correlation(t: Tensor, g: Tensor, weight: Tensor) -> Tensor:
+    """Zero-mean normalised correlation (B,) of t and g (B, N) under weights (1 or B, N); 0 where either is flat."""
+    (t0, dt), (g0, dg) = centred(t, weight), centred(g, weight)
+    norm = dt * dg
+    score = (weight * t0 * g0).sum(-1) / norm.clamp(min=1e-30)
+    return torch.where(norm > 1e-12 * (weight * g * g).sum(-1), score, 0.0).clamp(-1, 1)
+
+
+def information(reference: Reference, noise_power: Tensor) -> tuple[Tensor, Tensor]:
+    """``slope`` (B, 3, 3) less what a template noise of variance ``noise_power`` (B,) adds to it; and whether texture
+    rather than that noise holds the pose in every direction, (B,) bool."""
+    slope = reference.slope - noise_power[:, None, None] * reference.inflation
+    excess = slope - (1 - NOISE_SHARE) * reference.slope
+    unit = reference.radius.new_ones(len(slope), 3)
+    unit[:, 2] = 1 / reference.radius  # theta in px at the farthest pixel
+    scaled = (excess + excess.mT) * unit[:, :, None] * unit[:, None, :]
+    _, failed = torch.linalg.cholesky_ex(scaled)
+    return slope, (failed == 0) & (scaled.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
+
+
+def pose_covariance(reference: Reference, power: Tensor, gain: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+    """Covariance (B, 3, 3) of poses (B, 3) whose fits left the mean square ``power`` (B,), and if the texture fixes
+    the pose, (B,) bool.
+
+    Sandwich of the instrumental-variable estimate, s^2 S^-1 (Z~ Z~^T) S^-T / gain^2, turned from the template's axes
+    to the frame's. The residual's variance s^2 = sigma_frame^2 + gain^2 sigma_template^2 holds the noise of both; S is
+    freed of the share of the template's.
+    """
+    p = reference.K.shape[1]
+    count = (reference.weight > 0).sum(-1)
+    variance = power * count / (count - p).clamp(min=1)
+    slope, textured = information(reference, variance / (1 + gain * gain))
+    inverse, regular = safe_inverse(slope)
+    local = inverse @ reference.spread @ inverse.mT * (variance / (gain * gain).clamp(min=1e-12))[:, None, None]
+    turn = torch.eye(3, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)
+    turn[:, :2, :2] = rotation(pose[:, 2])
+    covariance = turn @ local @ turn.mT
+    diagonal = covariance.diagonal(dim1=-2, dim2=-1)
+    corner = diagonal[:, 0] + diagonal[:, 1] + diagonal[:, 2] * reference.radius**2
+    return covariance, regular & textured & (corner < LARGEST_SIGMA**2)

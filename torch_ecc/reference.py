@@ -1,0 +1,188 @@
+"""Prepare once: everything about a template that stays constant while it is tracked (Algorithm 1, line 4).
+
+The columns R of a criterion become one matrix by the oblique (instrumental-variable) pseudo-inverse
+
+    K = (Z W R^T)^-1 Z W,        W the weights, Z the same columns made from the slightly blurred template.
+
+The noise of a template is in its own gradients too. With Z = R (least squares) that inflates the Hessian and shortens
+every step; blurred gradients are nearly independent of that noise and keep the step at its right length.
+
+In an inverse compositional scheme the increment is always taken at the identity of the template's own coordinates, so
+G at theta = 0 and with it K are exact for every theta of the target. (The paper calls the constant Hessian an
+approximation that serves while the motion between frames is small; with eq. 10 as the update it is none.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.criteria import Criterion, make_criterion
+from torch_ecc.frame import as_gray, as_mask
+from torch_ecc.pose import pose_dtype
+from torch_ecc.sampling import blur, gradients, noise_level, pad
+
+INSTRUMENT_BLUR = 0.8  # px; 0.7 to 1 serve alike
+MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
+SMALLEST = 5  # px: side of the smallest template
+
+
+class Reference(NamedTuple):
+    """B prepared templates of N pixels under a criterion of p columns.
+
+    ``pixels`` (3, N) homogeneous pixel positions relative to the middle of the template array; ``box`` (3, 4) the
+    corners of their bounding box; ``centre`` (B, 2) the point x' = 0 in the same coordinates; ``radius`` (B,) px from
+    there to the farthest pixel; ``noise`` (B,) upper estimate of the template's noise, grey levels; ``signal`` and
+    ``instrument`` (B, 4, N) = [G, t] raw and blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
+
+    For the covariance, each (B, 3, 3): ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other columns, and
+    ``inflation``, what white noise of unit variance in the template adds to ``slope``.
+    """
+
+    criterion: Criterion
+    pixels: Tensor
+    box: Tensor
+    centre: Tensor
+    radius: Tensor
+    noise: Tensor
+    signal: Tensor
+    instrument: Tensor
+    weight: Tensor
+    K: Tensor
+    slope: Tensor
+    spread: Tensor
+    inflation: Tensor
+
+    @property
+    def uv(self) -> Tensor:
+        """Pixel positions about the centre over half the bounding box, (B, 2, N): the light columns' coordinates."""
+        half = (self.box[:2, 2] - self.box[:2, 0]).clamp(min=1.0) / 2
+        return (self.pixels[:2] - self.centre[:, :, None]) / half[:, None]
+
+    def select(self, index: Tensor) -> Reference:
+        """The reference of the templates at ``index`` (n,)."""
+        if len(index) == len(self.K):
+            return self
+        shared = {"criterion", "pixels", "box"} | ({"weight"} if len(self.weight) == 1 else set())
+        return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
+        """``function`` applied to every tensor, ``lambda t: t.to(device)`` for instance."""
+        return Reference(self.criterion, *(function(v) for v in self[1:]))
+
+
+@torch.no_grad()
+def prepare(
+    template: Tensor,
+    *,
+    criterion: str | Criterion = "ecc",
+    illumination: str = "linear",
+    mask: Tensor | None = None,
+    centre: Tensor | None = None,
+) -> Reference:
+    """Everything constant of B templates: (B, 1, h, w), (C, h, w) or (h, w) -> Reference (eqs. 7, 8).
+
+    ``mask``: (h, w) or (B, h, w), True or a weight > 0 where the template counts. ``centre`` (B, 2): the point that
+    poses speak of, px from the middle of the array (default: the middle). Raises ValueError for bad shapes, dtypes,
+    NaN, unknown options and for templates of one single grey level.
+    """
+    chosen = make_criterion(criterion, illumination)
+    gray = as_gray("prepare", "template", template)
+    size = (gray.shape[-2], gray.shape[-1])
+    if min(size) < SMALLEST:
+        raise ValueError(f"prepare: template must be at least {SMALLEST}x{SMALLEST} px, got {size[0]}x{size[1]}")
+    kept = gray.new_ones(1, 1, *size) if mask is None else as_mask("prepare", mask, len(gray), size).to(gray.device)
+    _refuse_flat(gray, kept)
+    wide = pad(gray, MARGIN)
+    inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
+    sharp, soft = (torch.cat((gradients(image), image), 1)[inner] for image in (wide, blur(wide, INSTRUMENT_BLUR)))
+    centre = gray.new_zeros(len(gray), 2) if centre is None else centre.to(gray).expand(len(gray), 2)
+    return _assemble(chosen, sharp, soft, kept, centre)
+
+
+def _refuse_flat(gray: Tensor, kept: Tensor) -> None:
+    infinity = gray.new_tensor(float("inf"))
+    highest = torch.where(kept > 0, gray, -infinity).amax((1, 2, 3))
+    lowest = torch.where(kept > 0, gray, infinity).amin((1, 2, 3))
+    flat = (highest <= lowest).nonzero().flatten().tolist()
+    if flat:
+        raise ValueError(f"prepare: template must have texture, got one single grey level in template {flat}")
+
+
+def _assemble(criterion: Criterion, sharp: Tensor, soft: Tensor, kept: Tensor, centre: Tensor) -> Reference:
+    """Reference from the images [d/dx, d/dy, t] (B, 3, h, w), raw and blurred, and weights (1 or B, 1, h, w)."""
+    h, w = sharp.shape[-2:]
+    used = (kept > 0).any(0).flatten()
+    y, x = torch.meshgrid(*(torch.arange(n, device=sharp.device) - (n - 1) / 2 for n in (h, w)), indexing="ij")
+    pixels = torch.stack((x.flatten()[used], y.flatten()[used], torch.ones_like(x.flatten()[used])))
+    (left, top), (right, bottom) = pixels[:2].amin(-1).tolist(), pixels[:2].amax(-1).tolist()
+    box = pixels.new_tensor([[left, right, right, left], [top, top, bottom, bottom], [1, 1, 1, 1]])
+    weight = kept.flatten(1)[:, used]
+    local = pixels[:2] - centre[:, :, None]
+    signal, instrument = (_steepest_descent(image.flatten(2)[:, :, used], local) for image in (sharp, soft))
+    radius = (local.norm(dim=1) * (weight > 0)).amax(-1).to(pose_dtype(sharp.device))
+    noise = noise_level(sharp[:, 2:], kept)
+    nothing = radius.new_zeros(len(sharp), 3, 3)
+    constants = (pixels, box, centre, radius, noise, signal, instrument, weight)
+    return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing), weight > 0)
+
+
+def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:
+    """[G, t] (B, 4, N) from [d/dx, d/dy, t] (B, 3, N): eq. (8) at theta = 0 gives dW/dtheta = (y', -x')."""
+    gx, gy, t = image.unbind(1)
+    return torch.stack((gx, gy, gx * local[:, 1] - gy * local[:, 0], t), 1)
+
+
+def reweigh(reference: Reference, seen: Tensor) -> Reference:
+    """The reference of which only the pixels ``seen`` (1 or B, N), bool, count: new weight, K and covariance terms."""
+    weight = reference.weight * seen
+    uv = reference.uv
+    R, Z = (reference.criterion.columns(v, uv) for v in (reference.signal, reference.instrument))
+    ZW = Z * weight[:, None]
+    dtype = reference.radius.dtype
+    normal, power = (ZW @ R.mT).to(dtype), (ZW @ ZW.mT).to(dtype)
+    inverse, regular = safe_inverse(normal)
+    others, _ = safe_inverse(normal[:, 3:, 3:])
+    project = torch.eye(3, dtype=dtype, device=weight.device).expand(len(R), 3, 3)
+    project = torch.cat((project, -normal[:, :3, 3:] @ others), -1)
+    return reference._replace(
+        weight=weight,
+        K=(inverse @ ZW.to(dtype)).to(R.dtype),
+        slope=(project @ normal)[:, :, :3] * regular[:, None, None],
+        spread=project @ power @ project.mT,
+        inflation=_noise_slope(reference, weight) * noise_response(),
+    )
+
+
+def safe_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse (B, n, n), zero where ``matrix`` is singular to float32, and whether it is regular, (B,) bool.
+
+    Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude.
+    """
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    scale = diagonal.abs().clamp(min=1e-30).rsqrt()
+    unit = matrix * scale[:, :, None] * scale[:, None, :]
+    inverse, _ = torch.linalg.inv_ex(unit)
+    regular = (inverse.abs().sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
+    inverse = torch.where(regular[:, None, None], inverse, 0.0)
+    return inverse * scale[:, :, None] * scale[:, None, :], regular
+
+
+def _noise_slope(reference: Reference, weight: Tensor) -> Tensor:
+    """Sum over the pixels of w (dW/dp)^T dW/dp, (B, 3, 3): the shape of Z W G^T when the gradients are white noise."""
+    x, y = (reference.pixels[:2] - reference.centre[:, :, None]).unbind(1)
+    n, wx, wy, wr = (v.sum(-1).to(reference.radius.dtype) for v in torch.broadcast_tensors(weight, weight * x, weight * y, weight * (x * x + y * y)))
+    zero = torch.zeros_like(n)
+    return torch.stack((n, zero, wy, zero, n, -wx, wy, -wx, wr), -1).unflatten(-1, (3, 3))
+
+
+@lru_cache(maxsize=1)
+def noise_response() -> float:
+    """Mean product of the raw and the blurred x derivative of white noise of unit variance."""
+    impulse = torch.zeros(1, 1, 33, 33)
+    impulse[..., 16, 16] = 1.0
+    return float((gradients(impulse)[:, 0] * gradients(blur(impulse, INSTRUMENT_BLUR))[:, 0]).sum())

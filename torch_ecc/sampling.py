@@ -1,0 +1,223 @@
+"""Image values between pixels: B-spline and bilinear sampling, gradients, blur and pyramid.
+
+The one place that knows the coordinates of ``grid_sample`` and of kornia. Everywhere else a point is (x, y) in px with
+pixel centres at integers, and a warp is a 2x3 matrix that takes homogeneous template pixels (3, N) to such points.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from kornia.filters import gaussian_blur2d
+from torch import Tensor
+
+REACH = 10  # px around a patch that its B-spline still feels: 0.43 ** 10 = 2e-4 of the border's contrast, at degree 5
+TAPS = {3: (4 / 6, 1 / 6), 5: (66 / 120, 26 / 120, 1 / 120)}  # centred B-splines at 0, 1, 2
+SLOPE = {3: (0.0, 1 / 2), 5: (0.0, 10 / 24, 1 / 24)}  # minus their derivatives there
+
+
+class Bilinear(NamedTuple):
+    """Bilinear sampler of ``image`` (I, 1, H, W), I = 1 (shared by all templates, not copied) or one per template.
+
+    ``edge``: the frame's size (h, w) if templates may reach beyond it, None if all are known to lie inside.
+    """
+
+    image: Tensor
+    edge: tuple[int, int] | None = None
+
+    def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
+        """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside the image its border repeats."""
+        scale, shift = _unit_square(*self.image.shape[-2:], warp.dtype, warp.device)
+        unit = torch.cat((warp[:, :, :2] * scale, warp[:, :, 2:] * scale + shift), -1)
+        return _lookup(self.image, unit.to(self.image.dtype) @ pixels)
+
+    def select(self, index: Tensor) -> Bilinear:
+        """The sampler of some of the templates."""
+        return self if len(self.image) in (1, len(index)) else self._replace(image=self.image[index])
+
+
+class BSpline(NamedTuple):
+    """Sampler of the interpolating B-spline of ``degree`` 3 or 5, from its coefficients (I, 1, h, w).
+
+    ``origin`` (I, 2) is the frame position of coefficient (0, 0): coordinates stay small, so float32 holds 1e-5 px.
+    """
+
+    coefficients: Tensor
+    origin: Tensor
+    degree: int
+    edge: tuple[int, int] | None = None
+
+    def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
+        """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N).
+
+        A B-spline is non-negative, so each pair of neighbouring taps is one bilinear lookup at their centre of mass
+        (Ruijters et al., 2008): (degree + 1)^2 / 4 lookups instead of (degree + 1)^2 gathers.
+        """
+        local = torch.cat((warp[:, :, :2], warp[:, :, 2:] - self.origin[:, :, None]), -1)
+        points = local.to(pixels.dtype) @ pixels
+        scale, shift = _unit_square(*self.coefficients.shape[-2:], points.dtype, points.device)
+        floor = points.floor()
+        weights = _weights(points - floor, self.degree)
+        columns = []  # per pair of taps: total weight and normalised coordinate of their lookup, both (B, 2, N)
+        for first in range(0, self.degree + 1, 2):
+            total = weights[first] + weights[first + 1]
+            position = floor + (first - self.degree // 2) + weights[first + 1] / total
+            columns.append((total, position * scale + shift))
+        values = torch.zeros_like(points[:, 0])
+        for wx, x in columns:
+            for wy, y in columns:
+                look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), 1))
+                values.addcmul_(look, wx[:, 0] * wy[:, 1])
+        return values
+
+    def select(self, index: Tensor) -> BSpline:
+        """The sampler of some of the templates."""
+        if len(self.coefficients) in (1, len(index)):
+            return self
+        return self._replace(coefficients=self.coefficients[index], origin=self.origin[index])
+
+
+Sampler = Bilinear | BSpline
+
+
+def make_sampler(interpolation: str, image: Tensor, warp: Tensor, box: Tensor) -> Sampler:
+    """The sampler of ``image`` (I, 1, H, W) around the patches ``warp`` (B, 2, 3) of the template rectangle.
+
+    ``box`` (3, 4): the rectangle's corners. A B-spline is prefiltered only in the neighbourhood of the patches, unless
+    so many share one image that filtering all of it is less work. One host synchronisation on an accelerator.
+    """
+    if interpolation == "bilinear":
+        return Bilinear(image)
+    degree = int(interpolation[-1])
+    h, w = image.shape[-2:]
+    corners = warp @ box.to(warp.dtype)
+    low = corners.amin(-1).floor() - REACH
+    extent = int((corners.amax(-1).ceil() + REACH - low).amax()) + 1
+    side = -(-extent // 16) * 16  # few different sizes, so that the prefilter matrices are reused
+    shared = len(image) == 1 and len(warp) * 2 * side**3 >= h * w * (h + w)
+    if shared or side >= max(h, w) or not low.isfinite().all():
+        return BSpline(prefilter(image, degree), warp.new_zeros(1, 2), degree)
+    low = torch.minimum(low, low.new_tensor((w - 1.0 + REACH, h - 1.0 + REACH))).clamp(min=-side)
+    return BSpline(prefilter(_crop(image, low.long(), side), degree), low, degree)
+
+
+def inside(warp: Tensor, pixels: Tensor, size: tuple[int, int], margin: float = 0.0) -> Tensor:
+    """Which ``pixels`` (3, N) the ``warp`` (B, 2, 3) puts at least ``margin`` px inside a frame (h, w): bool (B, N)."""
+    x, y = (warp.to(pixels.dtype) @ pixels).unbind(1)
+    h, w = size
+    return (x >= margin) & (x <= w - 1 - margin) & (y >= margin) & (y <= h - 1 - margin)
+
+
+def _crop(image: Tensor, origin: Tensor, side: int) -> Tensor:
+    """Squares (B, 1, side, side) of ``image`` from ``origin`` (B, 2) = (x, y); beyond the border the image mirrors."""
+    run = torch.arange(side, device=image.device)
+    x = _mirror(origin[:, :1] + run, image.shape[-1])
+    y = _mirror(origin[:, 1:] + run, image.shape[-2])
+    which = torch.arange(len(image), device=image.device)[:, None, None]
+    return image[which, 0, y[:, :, None], x[:, None, :]][:, None]
+
+
+def _mirror(index: Tensor, size: int) -> Tensor:
+    period = max(2 * size - 2, 1)
+    index = index.remainder(period)
+    return torch.minimum(index, period - index)
+
+
+@lru_cache(maxsize=64)
+def _unit_square(h: int, w: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
+    """Scale (2, 1) and shift from px to grid_sample's coordinates: the outer pixel centres lie at -1 and 1."""
+    return torch.tensor([[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]], dtype=dtype, device=device), -1.0
+
+
+def _lookup(image: Tensor, points: Tensor) -> Tensor:
+    """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, 2, N): (B, N)."""
+    grid = points.movedim(1, -1)[:, None]
+    image = image.expand(len(points), -1, -1, -1)
+    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[:, 0, 0]
+
+
+def _weights(f: Tensor, degree: int) -> list[Tensor]:
+    """B-spline weights of the degree + 1 taps around a point with fractional part ``f``, any shape."""
+    r = 1 - f
+    if degree == 3:
+        f2, r2 = f * f, r * r
+        return [r2 * r / 6, 2 / 3 - f2 * (1 - f / 2), 2 / 3 - r2 * (1 - r / 2), f2 * f / 6]
+    return [
+        r**5 / 120,
+        ((1 + r) ** 5 - 6 * r**5) / 120,
+        ((2 + r) ** 5 - 6 * (1 + r) ** 5 + 15 * r**5) / 120,
+        ((2 + f) ** 5 - 6 * (1 + f) ** 5 + 15 * f**5) / 120,
+        ((1 + f) ** 5 - 6 * f**5) / 120,
+        f**5 / 120,
+    ]
+
+
+@lru_cache(maxsize=64)
+def _spline_matrices(n: int, degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Prefilter (n, n): samples to B-spline coefficients, mirrored at the border; and slope (n, n) at the samples."""
+    index = torch.arange(n)
+    taps, slope = torch.zeros(2, n, n, dtype=torch.float64)
+    for offset in range(-(degree // 2), degree // 2 + 1):
+        column = _mirror(index + offset, n)
+        taps[index, column] += TAPS[degree][abs(offset)]
+        slope[index, column] += SLOPE[degree][abs(offset)] * (1 if offset > 0 else -1)
+    filter_ = torch.linalg.inv(taps)
+    return filter_.float().to(device), (slope @ filter_).float().to(device)
+
+
+def prefilter(image: Tensor, degree: int) -> Tensor:
+    """Coefficients of the interpolating B-spline of ``image`` (..., H, W), mirrored at its border (Unser, 1993).
+
+    Two products with a dense inverse: exact, and faster than a recursion or a 25-tap convolution in torch.
+    """
+    rows, _ = _spline_matrices(image.shape[-2], degree, image.device)
+    columns, _ = _spline_matrices(image.shape[-1], degree, image.device)
+    return rows @ image @ columns.mT
+
+
+def gradients(image: Tensor) -> Tensor:
+    """d/dx and d/dy at the pixels, (B, 1, H, W) -> (B, 2, H, W): the slope of the interpolating cubic B-spline."""
+    _, rows = _spline_matrices(image.shape[-2], 3, image.device)
+    _, columns = _spline_matrices(image.shape[-1], 3, image.device)
+    return torch.cat((image @ columns.mT, rows @ image), 1)
+
+
+def pad(image: Tensor, margin: int) -> Tensor:
+    """``image`` (B, 1, H, W) continued by ``margin`` px, odd about its border pixels: slopes stay what they are.
+
+    (A mirror image would put a kink at the border and halve the gradient there.)
+    """
+    for dim in (-1, -2):
+        n = image.shape[dim]
+        edges = image.narrow(dim, 0, 1), image.narrow(dim, n - 1, 1)
+        run = torch.arange(1, margin + 1, device=image.device).clamp(max=n - 1)
+        before = 2 * edges[0] - image.index_select(dim, run.flip(0))
+        after = 2 * edges[1] - image.index_select(dim, n - 1 - run)
+        image = torch.cat((before, image, after), dim)
+    return image
+
+
+def blur(image: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur of (B, 1, H, W)."""
+    size = 2 * int(4 * sigma + 0.5) + 1
+    return gaussian_blur2d(image, (size, size), (sigma, sigma), border_type="reflect")
+
+
+def halve(image: Tensor) -> Tensor:
+    """Next pyramid level of (B, 1, H, W): blurred, and pixel (i, j) of it lies exactly at (2 i, 2 j) of ``image``."""
+    return blur(image, 1.0)[:, :, ::2, ::2]
+
+
+def noise_level(image: Tensor, kept: Tensor) -> Tensor:
+    """Upper estimate of the white noise of (B, 1, H, W) where ``kept`` > 0, grey levels, (B,).
+
+    Median response to the difference of two Laplacians (Immerkaer, 1996), which cancels flat areas, ramps and edges
+    along rows or columns; what fine texture leaves in it counts as noise.
+    """
+    kernel = image.new_tensor([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])[None, None]
+    response = F.conv2d(image, kernel).abs().flatten(1) / 6
+    response = torch.where(kept[:, :, 1:-1, 1:-1].flatten(1) > 0, response, float("nan"))
+    return response.nanmedian(-1).values.nan_to_num() / 0.6745

@@ -1,0 +1,140 @@
+"""The loop: batched inverse compositional Gauss-Newton for x, y and theta (paper, Algorithm 1, lines 7 to 10)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.pose import compose, inverse, rotation
+from torch_ecc.reference import Reference, reweigh
+from torch_ecc.sampling import Sampler, inside, make_sampler
+
+COARSE_TOLERANCE = 0.02  # px; the bilinear iterations only have to come near: their own bias is some 0.005 px
+SYNC_EVERY = 4  # iterations between looks at what has converged on an accelerator; on a CPU every one
+EDGE = 4  # px: a template nearer than this to the frame's border may cross it while iterating
+LONGEST_STEP = 0.2  # of the template's radius: a longer one left the range in which the linearisation means anything
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to iterate and when to believe the result.
+
+    ``tolerance``: remaining error in px at the template's farthest pixel. A template is lost below ``min_score`` and
+    out of view when less than ``min_visible`` of its weight lies in the frame.
+    """
+
+    interpolation: str = "bspline3"
+    max_iterations: int = 15
+    tolerance: float = 1e-3
+    min_score: float = 0.5
+    min_visible: float = 0.25
+
+    def __post_init__(self) -> None:
+        known = ["bilinear", "bspline3", "bspline5"]
+        if self.interpolation not in known:
+            raise ValueError(f"interpolation: expected one of {known}, got {self.interpolation!r}")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations: expected at least 1, got {self.max_iterations}")
+        if not self.tolerance > 0:
+            raise ValueError(f"tolerance: expected a length in px > 0, got {self.tolerance}")
+        for name, value in (("min_score", self.min_score), ("min_visible", self.min_visible)):
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name}: expected a number from 0 to 1, got {value}")
+
+
+class State(NamedTuple):
+    """Of B templates: ``pose`` (B, 3), last ``step`` and predicted remaining ``error`` in px at the farthest pixel
+    (B,), ``iterations`` (B,) and the last sampled ``patch`` (B, N)."""
+
+    pose: Tensor
+    step: Tensor
+    error: Tensor
+    iterations: Tensor
+    patch: Tensor
+
+    @staticmethod
+    def start(reference: Reference, pose: Tensor) -> State:
+        """Before the first iteration."""
+        never = torch.full_like(pose[:, 0], float("inf"))
+        return State(pose, never, never, torch.zeros_like(never, dtype=torch.int64), torch.zeros_like(reference.K[:, 0]))
+
+    def select(self, index: Tensor) -> State:
+        """The state of some of the templates."""
+        return self if len(index) == len(self.pose) else State(*(v[index] for v in self))
+
+    def merge(self, index: Tensor, part: State) -> State:
+        """This state with the templates at ``index`` replaced by ``part``."""
+        if len(index) == len(self.pose):
+            return part
+        return State(*(v.index_copy(0, index, p) for v, p in zip(self, part, strict=True)))
+
+
+def warps(reference: Reference, pose: Tensor) -> Tensor:
+    """2x3 warps (B, 2, 3) that take ``reference.pixels`` to the frame: eq. (2) about the template's own centre."""
+    turn = rotation(pose[:, 2])
+    shift = pose[:, :2, None] - turn @ reference.centre[:, :, None].to(turn.dtype)
+    return torch.cat((turn, shift), -1)
+
+
+def gauss_newton(reference: Reference, sample: Sampler, state: State, tolerance: float) -> State:
+    """One iteration. Elements whose predicted error is below ``tolerance`` already stay as they are."""
+    pose, last = state.pose, state.step
+    warp = warps(reference, pose)
+    g = sample(warp, reference.pixels)  # I(W(p_k; x'))
+    seen = reference if sample.edge is None else reweigh(reference, inside(warp, reference.pixels, sample.edge))
+    delta = seen.criterion.step(seen, g).to(pose.dtype)  # eq. (9), or a better one
+    step = torch.hypot(torch.hypot(delta[:, 0], delta[:, 1]), delta[:, 2] * reference.radius)
+    usable = step.isfinite() & (state.error > tolerance)
+    delta = delta * (LONGEST_STEP * reference.radius / step).clamp(max=1)[:, None]
+    moved = compose(pose, inverse(delta))  # eq. (10)
+    rate = torch.where(last.isfinite(), step / last, 0.5).clamp(0.05, 0.95)  # linear convergence
+    error = torch.where(usable, step * rate / (1 - rate), 0.0)
+    return State(
+        torch.where(usable[:, None], moved, pose), torch.where(usable, step, last), error, state.iterations + usable, g
+    )
+
+
+def iterate(reference: Reference, sample: Sampler, state: State, tolerance: float, budget: int) -> State:
+    """Gauss-Newton until every predicted error is below ``tolerance`` or ``budget`` iterations are spent."""
+    result, index = state, torch.arange(len(state.pose), device=state.pose.device)
+    period = 1 if index.device.type == "cpu" else SYNC_EVERY
+    for k in range(1, budget + 1):
+        state = gauss_newton(reference, sample, state, tolerance)
+        if k < budget and k % period == 0:
+            busy = (state.error > tolerance).nonzero()[:, 0]
+            if len(busy) == 0:
+                break
+            if len(busy) < len(index):  # converged elements stop costing
+                result = result.merge(index, state)
+                index, state = index[busy], state.select(busy)
+                reference, sample = reference.select(busy), sample.select(busy)
+    return result.merge(index, state)
+
+
+def refine(reference: Reference, image: Tensor, state: State, settings: Settings) -> State:
+    """From a start within the basin to the answer: bilinear iterations first, the asked interpolation to finish."""
+    budget = settings.max_iterations
+    if settings.interpolation != "bilinear" and budget > 1:
+        coarse = max(budget * 2 // 3, 1)
+        state = stage(reference, image, state, "bilinear", max(settings.tolerance, COARSE_TOLERANCE), coarse)
+        budget -= coarse
+    return stage(reference, image, state, settings.interpolation, settings.tolerance, budget)
+
+
+def stage(
+    reference: Reference, image: Tensor, state: State, interpolation: str, tolerance: float, budget: int
+) -> State:
+    """``iterate`` with one sampler; templates that reach beyond the frame are weighed anew at every iteration."""
+    state = state._replace(error=torch.full_like(state.error, float("inf")))
+    warp, size = warps(reference, state.pose), (image.shape[-2], image.shape[-1])
+    sample = make_sampler(interpolation, image, warp, reference.box)
+    whole = inside(warp, reference.box, size, margin=EDGE).all(-1)
+    for index, edge in ((whole, None), (~whole, size)):
+        some = index.nonzero()[:, 0]
+        if len(some):
+            part = sample._replace(edge=edge).select(some)
+            state = state.merge(some, iterate(reference.select(some), part, state.select(some), tolerance, budget))
+    return state
