@@ -9,7 +9,7 @@ from torch_ecc.criteria import centred
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.pose import rotation
 from torch_ecc.reference import Reference, reweigh, safe_inverse
-from torch_ecc.sampling import inside
+from torch_ecc.sampling import NOISE_GAIN, inside
 from torch_ecc.solver import Settings, State, warps
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
@@ -27,7 +27,8 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     residual, gain = (v.to(pose.dtype) for v in reference.criterion.fit(reference, state.patch))
     power = (weight * residual * residual).sum(-1) / weight.sum(-1).clamp(min=1e-30)
     score = correlation(reference.signal[:, 3], state.patch, weight).to(pose.dtype)
-    covariance, fixed = pose_covariance(reference, power, gain, pose)
+    noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
+    covariance, fixed = pose_covariance(reference, noise, gain, pose)
     weak = ~information(reference, reference.noise.to(pose.dtype) ** 2)[1]
     lost = ~((score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1))
     status = torch.full_like(score, Status.CONVERGED, dtype=torch.int8)
@@ -66,20 +67,23 @@ def information(reference: Reference, noise_power: Tensor) -> tuple[Tensor, Tens
     return slope, (failed == 0) & (scaled.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
 
 
-def pose_covariance(reference: Reference, power: Tensor, gain: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-    """Covariance (B, 3, 3) of poses (B, 3) whose fits left the mean square ``power`` (B,), and if the texture fixes
-    the pose, (B,) bool.
+def noise_variance(reference: Reference, power: Tensor, gain: Tensor, sampled: float) -> Tensor:
+    """Variance (B,) of the noise of one image, from the residuals' mean square ``power`` (B,) = the template's share
+    gain^2 v plus the frame's, of which its sampling left ``sampled`` v; freed of the fitted columns' part."""
+    count, columns = (reference.weight > 0).sum(-1), reference.K.shape[1]
+    return power * count / (count - columns).clamp(min=1) / (gain * gain + sampled)
 
-    Sandwich of the instrumental-variable estimate, s^2 S^-1 (Z~ Z~^T) S^-T / gain^2, turned from the template's axes
-    to the frame's. The residual's variance s^2 = sigma_frame^2 + gain^2 sigma_template^2 holds the noise of both; S is
-    freed of the share of the template's.
+
+def pose_covariance(reference: Reference, noise: Tensor, gain: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+    """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of variance ``noise`` (B,), the patch
+    ``gain`` (B,) times the template's contrast; and whether the texture fixes the pose, (B,) bool.
+
+    Sandwich of the instrumental-variable estimate: (1 + 1 / gain^2) v S^-1 (Z~ Z~^T) S^-T, turned from the template's
+    axes to the frame's. S is freed of the template noise in it.
     """
-    p = reference.K.shape[1]
-    count = (reference.weight > 0).sum(-1)
-    variance = power * count / (count - p).clamp(min=1)
-    slope, textured = information(reference, variance / (1 + gain * gain))
+    slope, textured = information(reference, noise)
     inverse, regular = safe_inverse(slope)
-    local = inverse @ reference.spread @ inverse.mT * (variance / (gain * gain).clamp(min=1e-12))[:, None, None]
+    local = inverse @ reference.spread @ inverse.mT * (noise * (1 + 1 / (gain * gain).clamp(min=1e-12)))[:, None, None]
     turn = torch.eye(3, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)
     turn[:, :2, :2] = rotation(pose[:, 2])
     covariance = turn @ local @ turn.mT

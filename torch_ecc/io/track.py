@@ -7,7 +7,6 @@ exception or by Ctrl-C: whatever bears a final name is whole. Memory does not gr
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_ecc.io.records import FIELDS, Record, StatusNames, sigma, to_arrays, words
+from torch_ecc.io.output import check_folder, part, publish
+from torch_ecc.io.records import FIELDS, Record, StatusNames, to_arrays, words
 from torch_ecc.io.summary import summarise, write_json
+from torch_ecc.io.table import Table
 
 
 class TrackWriter:
@@ -76,16 +77,18 @@ class TrackWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         files, self._files = self._files, None
-        if files is None:
-            return
+        if files is not None and files.close():
+            self._finish(files, error)
+
+    def _finish(self, files: _PartFiles, error: BaseException | None) -> None:
         seconds = time.perf_counter() - self._started
-        records = files.close()
+        records = files.records()
         files.write_npz(records, self._constants(files.frames))
-        summary = summarise(records, self.status_names, reason=describe(error))
+        summary = summarise(records, self.status_names, error)
         summary |= {"frames_per_s": files.frames / seconds, "fps": self.fps, "settings": self.settings}
         if self.um_matrix is not None:
             summary["um_per_px"] = np.linalg.norm(self.um_matrix, axis=0).tolist()
-        write_json(self.out_dir / "summary.json.part", summary)
+        write_json(part(self.out_dir, "summary.json"), summary)
         del records  # the memory map, which would keep the file busy on some systems
         files.publish()
 
@@ -102,51 +105,54 @@ class TrackWriter:
 
 
 class _PartFiles:
-    """The files of a run that is not finished: one text row and one binary record per template, appended."""
+    """The files of a run that is not finished: text rows and one binary record per frame, appended."""
 
     def __init__(self, folder: Path, arrays: Mapping[str, NDArray[Any]], *, timed: bool) -> None:
-        count, fields = len(arrays["pose"]), dict(FIELDS)
-        if "displacement_um" in arrays:
+        count, fields, micrometres = len(arrays["pose"]), dict(FIELDS), "displacement_um" in arrays
+        if micrometres:
             fields["displacement_um"] = ("f8", (2,))
         self._dtype = np.dtype([(name, dtype, (count, *tail)) for name, (dtype, tail) in fields.items()])
+        self._table = Table(timed=timed, micrometres=micrometres)
         self._folder, self.frames = folder, 0
         folder.mkdir(parents=True, exist_ok=True)
-        self._csv = self._part("track.csv").open("wb")
-        self._records = self._part("track.records").open("wb")
-        self._csv.write(_header(timed=timed, micrometres="displacement_um" in arrays).encode())
-        self._csv_bytes = self._csv.tell()
+        self._csv, self._records = part(folder, "track.csv").open("wb"), part(folder, "track.records").open("wb")
+        self._csv_bytes = self._csv.write(self._table.header.encode())
 
     def append(self, arrays: Mapping[str, NDArray[Any]], status: list[str], time_s: float | None) -> None:
         row = np.zeros((), self._dtype)
         for name in row.dtype.names or ():
             if arrays[name].shape != row[name].shape:
-                raise ValueError(f"write: this record has {len(arrays[name])} templates, earlier ones {len(row[name])}")
+                raise ValueError(
+                    f"write: record must have {len(row[name])} templates as before, got {len(arrays[name])}"
+                )
             row[name] = arrays[name]
-        text = _rows(self.frames, time_s, arrays, status).encode()
+        text = self._table.rows(self.frames, time_s, arrays, status).encode()
         self._records.write(row.tobytes())
         self._csv.write(text)
-        # A frame counts from here on: what Ctrl-C leaves half-written behind these marks is cut off by close().
+        # A frame counts from here on: what an interrupt leaves half-written behind these marks is cut off by close().
         self.frames, self._csv_bytes = self.frames + 1, self._csv_bytes + len(text)
 
-    def close(self) -> NDArray[Any]:
-        """The whole frames: (F,) records, mapped from the file."""
+    def close(self) -> bool:
+        """Cut both files after the last whole frame; False, and no files, if there is none."""
         for file, size in ((self._csv, self._csv_bytes), (self._records, self.frames * self._dtype.itemsize)):
-            file.flush()
             file.truncate(size)
             file.close()
-        return np.memmap(self._part("track.records"), self._dtype, "r", shape=(self.frames,))
+            if not self.frames:
+                Path(file.name).unlink()
+        return self.frames > 0
+
+    def records(self) -> NDArray[Any]:
+        """(F,) records, mapped from the file."""
+        return np.memmap(part(self._folder, "track.records"), self._dtype, "r", shape=(self.frames,))
 
     def write_npz(self, records: NDArray[Any], constants: Mapping[str, NDArray[Any]]) -> None:
         """Each field of the records as an array (F, R, ...), copied through a small buffer, and the constants."""
-        with self._part("track.npz").open("wb") as file:
-            np.savez(file, **{name: records[name] for name in records.dtype.names or ()}, **constants)
+        fields: dict[str, Any] = {name: records[name] for name in records.dtype.names or ()} | dict(constants)
+        with part(self._folder, "track.npz").open("wb") as file:
+            np.savez(file, **fields)
 
     def publish(self) -> None:
         # The old summary goes first and the new one comes last: a summary always belongs to the files beside it.
         (self._folder / "summary.json").unlink(missing_ok=True)
-        for name in ("track.csv", "track.npz", "summary.json"):
-            os.replace(self._part(name), self._folder / name)
-        self._part("track.records").unlink()
-
-    def _part(self, name: str) -> Path:
-        return self._folder / f"{name}.part"
+        publish(self._folder, "track.csv", "track.npz", "summary.json")
+        part(self._folder, "track.records").unlink()

@@ -1,0 +1,117 @@
+"""A picture to draw on: a frame as 8-bit colours, with lines and labels placed to a fraction of a pixel.
+
+Everything is given in frame pixels and sized to the picture, so that it reads the same at 250 x 250 and 2048 x 2048.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from math import ceil
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+Colour: TypeAlias = tuple[int, int, int]
+"""Blue, green, red: OpenCV's order."""
+
+WHITE: Colour = (245, 245, 245)
+_DARK: Colour = (20, 20, 20)
+_SMALLEST, _SHIFT = 400, 4  # smaller frames are enlarged; lines are placed to 1/16 px
+
+
+class Box(NamedTuple):
+    """A rectangle of the canvas, in its own pixels."""
+
+    x: int
+    y: int
+    w: int
+    h: int
+
+    def overlap(self, other: Box) -> int:
+        """The common area in px."""
+        w = min(self.x + self.w, other.x + other.w) - max(self.x, other.x)
+        h = min(self.y + self.h, other.y + other.h) - max(self.y, other.y)
+        return max(w, 0) * max(h, 0)
+
+
+class Stretch(NamedTuple):
+    """The grey levels that become black and white."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, frame: Tensor) -> Stretch:
+        """The whole range of 8 bits as it is; of anything else what 99.8 % of the pixels of ``frame`` lie in."""
+        if frame.dtype.itemsize == 1:
+            return cls(0.0, 255.0)
+        low, high = np.nanpercentile(frame.cpu().numpy(), (0.1, 99.9))
+        return cls(float(low), float(max(high, np.nextafter(low, np.inf))))
+
+    def apply(self, frame: Tensor) -> NDArray[np.uint8]:
+        """(H, W) or (C, H, W) -> (H, W, 3) in OpenCV's order."""
+        pixels = frame.detach().cpu().numpy()
+        if pixels.dtype != np.uint8:
+            scaled = (pixels.astype(np.float32) - self.low) * (255.0 / (self.high - self.low))
+            pixels = np.nan_to_num(scaled).clip(0, 255).round().astype(np.uint8)
+        planes = pixels[None] if pixels.ndim == 2 else pixels
+        return np.ascontiguousarray(np.moveaxis(planes[::-1] if len(planes) == 3 else planes[[0, 0, 0]], 0, -1))
+
+
+class Canvas:
+    """``image`` is (h, w, 3) uint8; ``scale`` sizes lines and letters, 1 for 480 px; ``gap`` is the usual distance."""
+
+    def __init__(self, picture: NDArray[np.uint8]) -> None:
+        shortest = min(picture.shape[:2])
+        self._zoom = ceil(_SMALLEST / shortest)
+        self.image = np.ascontiguousarray(picture.repeat(self._zoom, 0).repeat(self._zoom, 1))
+        self.scale = max(1.0, shortest * self._zoom / 480)
+        self.gap = round(3 * self.scale)
+
+    def place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Frame pixels to canvas pixels, (..., 2): both count from the middle of their first pixel."""
+        placed: NDArray[np.float64] = (points + 0.5) * self._zoom - 0.5
+        return placed
+
+    def line(self, points: NDArray[np.float64], colour: Colour, *, closed: bool = False, width: float = 1.0) -> None:
+        """A line through (N, 2) frame points, with a dark rim that keeps it visible on any texture."""
+        fixed = np.round(self.place(points) * (1 << _SHIFT)).astype(np.int32)[:, None]
+        thickness = max(1, round(width * self.scale))
+        rim = thickness + 2 * max(1, round(0.6 * self.scale))
+        for shade, size in ((_DARK, rim), (colour, thickness)):
+            cv2.polylines(self.image, [fixed], closed, shade, size, cv2.LINE_AA, _SHIFT)
+
+    def measure(self, text: str) -> tuple[int, int]:
+        """Width and height in canvas px of the label that ``text`` makes."""
+        right, bottom = _DRAW.multiline_textbbox((0, 0), text, self._font(), spacing=self.gap)[2:]
+        return ceil(right) + 4 * self.gap, ceil(bottom) + 2 * self.gap
+
+    def label(self, x: int, y: int, text: str, colour: Colour) -> None:
+        """``text`` on dark ground, an edge of ``colour``; its top left at (x, y) canvas px or the nearest inside."""
+        (w, h), pad = self.measure(text), self.gap
+        height, width = self.image.shape[:2]
+        x, y = max(0, min(x, width - w)), max(0, min(y, height - h))
+        ground = self.image[y : y + h, x : x + w]
+        ink = Image.new("L", (ground.shape[1], ground.shape[0]))
+        ImageDraw.Draw(ink).multiline_text((3 * pad, pad), text, 255, self._font(), spacing=pad)
+        alpha = np.asarray(ink, np.float32)[..., None] / 255
+        ground[:] = (1 - alpha) * (0.3 * ground) + alpha * np.array(WHITE, np.float32)
+        ground[:, :pad] = colour
+
+    def _font(self) -> ImageFont.FreeTypeFont:
+        return _load_font(round(12.5 * self.scale))
+
+
+@cache
+def _load_font(size: int) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which comes with matplotlib and knows theta and the degree sign."""
+    return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+
+
+_DRAW = ImageDraw.Draw(Image.new("L", (1, 1)))

@@ -1,0 +1,79 @@
+"""summary.json: how a run went, for people and for scripts."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torch_ecc.io.records import CONVERGED, DOUBTFUL, StatusNames
+
+
+def summarise(records: NDArray[Any], names: StatusNames, error: BaseException | None) -> dict[str, object]:
+    """What (F,) records of R templates say; ``error`` is what ended the run before its time, if anything did."""
+    templates = records["score"].shape[1]
+    return {
+        "complete": error is None,
+        "reason": _describe(error),
+        "frames": len(records),
+        "templates": templates,
+        "per_template": [_summarise_template(records, names, index) for index in range(templates)],
+        "versions": _versions(),
+    }
+
+
+def write_json(path: Path, summary: dict[str, object]) -> None:
+    """Strict JSON: what is not finite becomes null, what JSON does not know becomes its text."""
+    path.write_text(json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _summarise_template(records: NDArray[Any], names: StatusNames, index: int) -> dict[str, object]:
+    status = np.asarray(records["status"][:, index])
+    codes, counts = np.unique(status, return_counts=True)
+    found = [code for code, word in names.items() if word in (CONVERGED, DOUBTFUL)]
+    lost = np.flatnonzero(~np.isin(status, found))
+    variance = (records["covariance"][:, index, axis, axis] for axis in range(3))
+    return {
+        "status": {names[int(code)]: int(count) for code, count in zip(codes, counts, strict=True)},
+        "lost_frames": len(lost),
+        "first_lost_frame": int(lost[0]) if len(lost) else None,
+        "last_lost_frame": int(lost[-1]) if len(lost) else None,
+        "mean_score": float(np.mean(records["score"][:, index])),
+        "median_sigma": {
+            name: math.sqrt(np.median(values))
+            for name, values in zip(("x_px", "y_px", "theta_rad"), variance, strict=True)
+        },
+    }
+
+
+def _describe(error: BaseException | None) -> str | None:
+    if error is None:
+        return None
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted by the user"
+    return f"{type(error).__name__}: {error}"
+
+
+def _versions() -> dict[str, str]:
+    try:
+        package = version("torch-ecc")
+    except PackageNotFoundError:
+        package = "not installed"
+    return {"torch_ecc": package, "torch": torch.__version__, "python": platform.python_version()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
