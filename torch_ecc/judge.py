@@ -81,7 +81,7 @@ def pose_covariance(reference: Reference, noise: Tensor, gain: Tensor, pose: Ten
     Sandwich of the instrumental-variable estimate: (1 + 1 / gain^2) v S^-1 (Z~ Z~^T) S^-T, turned from the template's
     axes to the frame's. S is freed of the template noise in it.
     """
-    slope, textured = information(reference, noise)
+    slope, textured = information(reference, torch.minimum(noise, reference.noise.to(noise.dtype) ** 2))
     inverse, regular = safe_inverse(slope)
     local = inverse @ reference.spread @ inverse.mT * (noise * (1 + 1 / (gain * gain).clamp(min=1e-12)))[:, None, None]
     turn = torch.eye(3, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)
