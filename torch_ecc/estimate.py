@@ -35,7 +35,7 @@ _SENTENCES = {
     Status.MAX_ITERATIONS: "The pose was still moving by more than the tolerance when the iterations ran out.",
     Status.LOST: "The frame does not look like the template near the expected place; the last good pose is kept.",
     Status.OUT_OF_VIEW: "Too little of the template lies inside the frame; the last good pose is kept.",
-    Status.LOW_TEXTURE: "The template has too little texture for its noise to fix x, y and theta; choose another patch.",
+    Status.LOW_TEXTURE: "The template has too little texture to fix x, y and theta; choose another patch.",
 }
 
 

@@ -13,7 +13,8 @@ from torch_ecc.sampling import NOISE_GAIN, inside
 from torch_ecc.solver import Settings, State, warps
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
-NOISE_SHARE = 0.9  # at most so much of the information in any direction may be the template's own noise
+NOISE_SHARE = 0.8  # of the information in some direction is the template's noise: not even a good match helps
+DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
 
 
 def judge(reference: Reference, size: tuple[int, int], state: State, start: Tensor, settings: Settings) -> Estimate:
@@ -21,6 +22,7 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     pose = state.pose
     seen = inside(warps(reference, pose), reference.pixels, size)
     visible = (reference.weight * seen).sum(-1) / reference.weight.sum(-1)
+    _, textured = information(reference, reference.noise.to(pose.dtype) ** 2, DOUBTFUL_SHARE)
     if not bool(seen.all()):
         reference = reweigh(reference, seen)
     weight = reference.weight
@@ -29,15 +31,14 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     score = correlation(reference.signal[:, 3], state.patch, weight).to(pose.dtype)
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
     covariance, fixed = pose_covariance(reference, noise, gain, pose)
-    weak = ~information(reference, reference.noise.to(pose.dtype) ** 2)[1]
-    lost = ~((score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1))
+    good_match = (score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
     status = torch.full_like(score, Status.CONVERGED, dtype=torch.int8)
     for code, found in (  # from the least to the most telling
         (Status.MAX_ITERATIONS, state.error > settings.tolerance),
         (Status.LOW_TEXTURE, ~fixed),
-        (Status.LOST, lost),
-        (Status.LOW_TEXTURE, lost & weak),
+        (Status.LOST, ~good_match),
         (Status.OUT_OF_VIEW, ~(visible >= settings.min_visible)),
+        (Status.LOW_TEXTURE, ~(good_match & (visible >= settings.min_visible)) & ~textured),
     ):
         status = torch.where(found, torch.full_like(status, code), status)
     good = Status.good(status)
@@ -55,11 +56,11 @@ def correlation(t: Tensor, g: Tensor, weight: Tensor) -> Tensor:
     return torch.where(norm > 1e-12 * (weight * g * g).sum(-1), score, 0.0).clamp(-1, 1)
 
 
-def information(reference: Reference, noise_power: Tensor) -> tuple[Tensor, Tensor]:
-    """``slope`` (B, 3, 3) less what a template noise of variance ``noise_power`` (B,) adds to it; and whether texture
-    rather than that noise holds the pose in every direction, (B,) bool."""
-    slope = reference.slope - noise_power[:, None, None] * reference.inflation
-    excess = slope - (1 - NOISE_SHARE) * reference.slope
+def information(reference: Reference, noise: Tensor, share: float = NOISE_SHARE) -> tuple[Tensor, Tensor]:
+    """``slope`` (B, 3, 3) less what a template noise of variance ``noise`` (B,) adds to it; and whether that noise is
+    less than ``share`` of it in every direction, (B,) bool."""
+    slope = reference.slope - noise[:, None, None] * reference.inflation
+    excess = slope - (1 - share) * reference.slope
     unit = reference.radius.new_ones(len(slope), 3)
     unit[:, 2] = 1 / reference.radius  # theta in px at the farthest pixel
     scaled = (excess + excess.mT) * unit[:, :, None] * unit[:, None, :]

@@ -31,9 +31,7 @@ class Patches(NamedTuple):
     mask: Tensor
 
 
-def locate_patches(
-    where: str, frame: Tensor, centers: Centers, size: Size, mask: Tensor | None
-) -> Patches:
+def locate_patches(where: str, frame: Tensor, centers: Centers, size: Size, mask: Tensor | None) -> Patches:
     """Check ``centers`` (R, 2) as (x, y), ``size`` and ``mask`` against the grey frame (1 or R, 1, H, W).
 
     Template pixels are frame pixels, never interpolated ones: an even size or a fractional centre only moves the point
@@ -55,7 +53,7 @@ def locate_patches(
         r = outside[0]
         x, y = place[r].tolist()
         raise ValueError(
-            f"{where}: template {r} ({w}x{h} px around x={x:g}, y={y:g}) must lie inside the frame of {width}x{height} px"
+            f"{where}: template {r} ({w}x{h} px around x={x:g}, y={y:g}) must lie in the frame of {width}x{height} px"
         )
     kept = torch.ones(len(place), 1, h, w) if mask is None else as_mask(where, mask, len(place), (h, w))
     return Patches(place, corner, (h, w), kept.to(frame.device))
@@ -102,10 +100,11 @@ def texture(
     noise: float | None = None,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """Predicted sigma (R, 3) px, px, rad of poses tracked with these patches, before any tracking: is a patch any good?
+    """Predicted sigma (R, 3) px, px, rad of poses tracked with these patches, before any tracking: are they any good?
 
-    ``noise``: standard deviation of the camera's noise in grey levels; by default it is estimated from each patch, where
-    fine texture counts as noise, so that the prediction errs on the safe side. Rounding of integer frames is added.
+    ``noise``: standard deviation of the camera's noise in grey levels; by default it is estimated from each patch,
+    where fine texture counts as noise, so that the prediction errs on the safe side. Rounding of integer frames is
+    added.
     Infinite where the texture does not fix the pose (Status.LOW_TEXTURE). Raises ValueError as ``Tracker`` does.
     """
     if noise is not None and not noise >= 0:

@@ -33,7 +33,7 @@ def pose_dtype(device: torch.device | str) -> torch.dtype:
 def rotation(theta: Tensor) -> Tensor:
     """Rotation block of eq. (2): (...) -> (..., 2, 2)."""
     c, s = theta.cos(), theta.sin()
-    return torch.stack((c, s, -s, c), -1).unflatten(-1, (2, 2))
+    return torch.stack((c, s, -s, c), -1).reshape(*theta.shape, 2, 2)
 
 
 def matrix(pose: Tensor) -> Tensor:

@@ -21,13 +21,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.criteria import Criterion, make_criterion
+from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.frame import as_gray, as_mask
 from torch_ecc.pose import pose_dtype
 from torch_ecc.sampling import blur, gradients, noise_level, pad
 
 INSTRUMENT_BLUR = 0.8  # px; 0.7 to 1 serve alike
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
+LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
 SMALLEST = 5  # px: side of the smallest template
 
 
@@ -39,8 +40,8 @@ class Reference(NamedTuple):
     there to the farthest pixel; ``noise`` (B,) upper estimate of the template's noise, grey levels; ``signal`` and
     ``instrument`` (B, 4, N) = [G, t] raw and blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
 
-    For the covariance, each (B, 3, 3): ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other columns, and
-    ``inflation``, what white noise of unit variance in the template adds to ``slope``.
+    For the covariance, each (B, 3, 3): ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other columns,
+    and ``inflation``, what white noise of unit variance in the template adds to ``slope``.
     """
 
     criterion: Criterion
@@ -125,7 +126,8 @@ def _assemble(criterion: Criterion, sharp: Tensor, soft: Tensor, kept: Tensor, c
     local = pixels[:2] - centre[:, :, None]
     signal, instrument = (_steepest_descent(image.flatten(2)[:, :, used], local) for image in (sharp, soft))
     radius = (local.norm(dim=1) * (weight > 0)).amax(-1).to(pose_dtype(sharp.device))
-    noise = noise_level(sharp[:, 2:], kept)
+    contrast = centred(signal[:, 3], weight)[1] / weight.sum(-1).sqrt()
+    noise = torch.maximum(noise_level(sharp[:, 2:], kept), LEAST_NOISE * contrast)
     nothing = radius.new_zeros(len(sharp), 3, 3)
     constants = (pixels, box, centre, radius, noise, signal, instrument, weight)
     return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing), weight > 0)
@@ -175,9 +177,10 @@ def safe_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
 def _noise_slope(reference: Reference, weight: Tensor) -> Tensor:
     """Sum over the pixels of w (dW/dp)^T dW/dp, (B, 3, 3): the shape of Z W G^T when the gradients are white noise."""
     x, y = (reference.pixels[:2] - reference.centre[:, :, None]).unbind(1)
-    n, wx, wy, wr = (v.sum(-1).to(reference.radius.dtype) for v in torch.broadcast_tensors(weight, weight * x, weight * y, weight * (x * x + y * y)))
+    moments = (weight.expand_as(x), weight * x, weight * y, weight * (x * x + y * y))
+    n, wx, wy, wr = (moment.sum(-1).to(reference.radius.dtype) for moment in moments)
     zero = torch.zeros_like(n)
-    return torch.stack((n, zero, wy, zero, n, -wx, wy, -wx, wr), -1).unflatten(-1, (3, 3))
+    return torch.stack((n, zero, wy, zero, n, -wx, wy, -wx, wr), -1).reshape(-1, 3, 3)
 
 
 @lru_cache(maxsize=1)

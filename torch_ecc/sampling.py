@@ -17,7 +17,7 @@ from torch import Tensor
 REACH = 10  # px around a patch that its B-spline still feels: 0.43 ** 10 = 2e-4 of the border's contrast, at degree 5
 TAPS = {3: (4 / 6, 1 / 6), 5: (66 / 120, 26 / 120, 1 / 120)}  # centred B-splines at 0, 1, 2
 SLOPE = {3: (0.0, 1 / 2), 5: (0.0, 10 / 24, 1 / 24)}  # minus their derivatives there
-# Variance of white noise after sampling, the mean over all sub-pixel phases: a sampler smooths what lies between pixels.
+# Variance of white noise after sampling, mean over all sub-pixel phases: a sampler smooths what lies between pixels.
 NOISE_GAIN = {"bilinear": 4 / 9, "bspline3": 0.7643, "bspline5": 0.8427}
 
 

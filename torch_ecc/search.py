@@ -13,7 +13,6 @@ from torch_ecc.reference import Reference
 from torch_ecc.sampling import Bilinear, inside
 from torch_ecc.solver import warps
 
-
 TURNS_DEG = (0.0, -8.0, 8.0, -16.0, 16.0, -24.0, 24.0)
 
 

@@ -59,7 +59,9 @@ class State(NamedTuple):
     def start(reference: Reference, pose: Tensor) -> State:
         """Before the first iteration."""
         never = torch.full_like(pose[:, 0], float("inf"))
-        return State(pose, never, never, torch.zeros_like(never, dtype=torch.int64), torch.zeros_like(reference.K[:, 0]))
+        return State(
+            pose, never, never, torch.zeros_like(never, dtype=torch.int64), torch.zeros_like(reference.K[:, 0])
+        )
 
     def select(self, index: Tensor) -> State:
         """The state of some of the templates."""

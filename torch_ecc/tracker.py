@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -42,8 +42,8 @@ class Tracker(nn.Module):
     "bilinear", "bspline3", "bspline5"; ``tolerance``: px at the template's corner; ``levels``: pyramid levels;
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
-    the frame's); ``min_score``: below it a template is lost. A template that is not found is searched for with a pyramid
-    around its last good pose, in this and the following frames. Raises ValueError for what does not fit.
+    the frame's); ``min_score``: below it a template is lost. A template that is not found is searched for with a
+    pyramid around its last good pose, in this and the following frames. Raises ValueError for what does not fit.
     """
 
     pose: Tensor
@@ -88,7 +88,7 @@ class Tracker(nn.Module):
         self.register_buffer("tracked", torch.ones_like(start[:, 0], dtype=torch.bool))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        super()._apply(fn, recurse)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self.references = [reference.map(fn) for reference in self.references]
         return self
 
@@ -119,8 +119,7 @@ class Tracker(nn.Module):
         """
         estimates: list[Estimate] = []
         try:
-            for frame in frames:
-                estimates.append(self.track(frame))
+            estimates.extend(map(self.track, frames))
         except ValueError as error:
             done = Track.stack(estimates) if estimates else None
             raise SequenceError(f"track_sequence: frame {len(estimates)}: {error}", done) from error

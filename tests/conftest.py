@@ -1,0 +1,30 @@
+"""Shared pieces of the tests: devices, analytic scenes, the Cramer-Rao bound."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+torch.set_num_threads(2)
+
+
+def devices() -> list[str]:
+    return ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
+
+
+@pytest.fixture(params=devices())
+def device(request: pytest.FixtureRequest) -> torch.device:
+    return torch.device(request.param)
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The real sequences; TORCH_ECC_DATA may name the folder."""
+    default = Path(__file__).parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("TORCH_ECC_DATA", default))
+    if not (folder / "README.md").is_file():
+        pytest.skip(f"real sequences are not at {folder}; TORCH_ECC_DATA names another place")
+    return folder

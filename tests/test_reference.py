@@ -1,0 +1,175 @@
+"""Laws of what is prepared once: the Jacobian, the oblique inverse, each criterion's step."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torch_ecc import ECC, SSD, PaperECC, prepare
+from torch_ecc.pose import transform
+from torch_ecc.reference import reweigh
+from torch_ecc.sim.scene import PlaneWaves
+
+SCENE = PlaneWaves.random(seed=3)
+CRITERIA = [ECC("gain"), ECC("linear"), ECC("quadratic"), PaperECC(), SSD()]
+
+
+def grid(h: int, w: int) -> torch.Tensor:
+    y, x = torch.meshgrid(torch.arange(h) - (h - 1) / 2, torch.arange(w) - (w - 1) / 2, indexing="ij")
+    return torch.stack((x.flatten(), y.flatten()), -1).double()
+
+
+def analytic_template(h: int, w: int) -> torch.Tensor:
+    return SCENE.value(grid(h, w)).reshape(1, 1, h, w).float()
+
+
+def least_squares(reference):
+    """The same reference with the raw template as its own instrument: ordinary least squares."""
+    return reweigh(reference._replace(instrument=reference.signal), reference.weight > 0)
+
+
+def rows_agree(a, b, tolerance):
+    """Each row to within ``tolerance`` of its own largest entry (rows have different units)."""
+    return bool(((a - b).abs().amax(-1) <= tolerance * b.abs().amax(-1)).all())
+
+
+@pytest.mark.parametrize("size", [(41, 41), (40, 51)])
+def test_steepest_descent_images_are_the_derivative_of_the_warped_scene(size):
+    points = grid(*size)
+
+    def warped(delta):
+        return SCENE.value(transform(delta, points))
+
+    exact = torch.autograd.functional.jacobian(warped, torch.zeros(3, dtype=torch.float64))  # (N, 3)
+    G = prepare(analytic_template(*size)).signal[0, :3].T.double()
+    inner = (points.abs() < torch.tensor([size[1] / 2 - 5, size[0] / 2 - 5])).all(-1)
+    error = (G - exact)[inner].square().mean(0).sqrt() / exact.square().mean(0).sqrt()
+    assert error.max() < 0.02  # what a cubic spline leaves at up to 0.25 cycles per px
+
+
+@pytest.mark.parametrize("criterion", CRITERIA, ids=str)
+def test_oblique_inverse_recovers_every_column(criterion):
+    """K R^T = 1: a patch that is a combination of the columns gets exactly its coefficients."""
+    reference = prepare(analytic_template(31, 27), criterion=criterion)
+    R = criterion.columns(reference.signal, reference.uv)
+    identity = (reference.K.double() @ R.double().mT)[0]
+    scale = R.double().square().mean(-1).sqrt()[0]
+    assert torch.allclose(identity * scale[:, None] / scale, torch.eye(len(identity)).double(), atol=1e-3)
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 10**6))
+def test_ecc_step_is_evangelidis_and_psarakis_with_roles_exchanged(seed):
+    """Their closed form (2008, eq. 14) for the template's Jacobian, least-squares projections and the image as target."""
+    reference = least_squares(prepare(analytic_template(25, 25), illumination="gain"))
+    generator = torch.Generator().manual_seed(seed)
+    t = reference.signal[0, 3].double()
+    g = 1.3 * t + 10 * torch.randn(len(t), generator=generator, dtype=torch.float64) + 5
+    G = reference.signal[0, :3].double()
+    t0, g0, G0 = t - t.mean(), g - g.mean(), G - G.mean(1, keepdim=True)
+    H = torch.linalg.inv(G0 @ G0.T)
+    P = G0.T @ H @ G0
+    gain = (t0 @ t0 - t0 @ P @ t0) / (g0 @ t0 - g0 @ P @ t0)
+    expected = H @ G0 @ (gain * g0 - t0)
+    step = ECC("gain").step(reference, g[None].float())[0].double()
+    assert torch.allclose(step, expected, rtol=2e-3, atol=1e-5)
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 10**6))
+def test_paper_ecc_is_equation_9_to_the_letter(seed):
+    reference = least_squares(prepare(analytic_template(25, 25), criterion="ecc_paper"))
+    generator = torch.Generator().manual_seed(seed)
+    h, J = reference.signal[0, 3].double(), reference.signal[0, :3].double().T
+    g = 0.8 * h + 3 * torch.randn(len(h), generator=generator, dtype=torch.float64) - 4
+    h0, g0 = h - h.mean(), g - g.mean()
+    equation_9 = -torch.linalg.inv(J.T @ J) @ J.T @ (h0 - h0.norm() / g0.norm() * g0)
+    step = PaperECC().step(reference, g[None].float())[0].double()
+    assert torch.allclose(step, equation_9, rtol=1e-3, atol=1e-6)
+
+
+def test_ssd_step_is_the_pseudo_inverse_of_the_difference():
+    reference = least_squares(prepare(analytic_template(25, 25), criterion="ssd"))
+    t, G = reference.signal[0, 3].double(), reference.signal[0, :3].double().T
+    g = t + torch.randn(len(t), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = torch.linalg.pinv(G) @ (g - t)
+    assert torch.allclose(SSD().step(reference, g[None].float())[0].double(), expected, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize(("illumination", "modes"), [("gain", 0), ("linear", 2), ("quadratic", 5)])
+def test_ecc_is_blind_to_the_light_that_it_models(illumination, modes):
+    """A gain polynomial of the modelled order, and any offset, ask for no step at all."""
+    reference = prepare(analytic_template(31, 31), illumination=illumination)
+    u, v = reference.uv[0]
+    t = reference.signal[0, 3]
+    terms = [u, v, u * u, v * v, u * v][:modes]
+    gain = 1.2 + sum((0.1 * (k + 1) * term for k, term in enumerate(terms)), torch.zeros_like(u))
+    step = reference.criterion.step(reference, (gain * t + 20)[None])[0]
+    assert step.abs().max() < 1e-4
+    fit = reference.criterion.fit(reference, (gain * t + 20)[None])
+    assert fit.residual.abs().max() < 0.02
+    assert float(fit.gain[0]) == pytest.approx(1.2, abs=1e-3)
+    more = (gain + 0.5 * u**3) * t  # a light that none of them models does ask for one
+    assert reference.criterion.step(reference, more[None])[0].abs().max() > 1e-4
+
+
+def test_a_gain_that_is_not_positive_asks_for_no_finite_step():
+    reference = prepare(analytic_template(25, 25))
+    assert not ECC().step(reference, -reference.signal[:, 3]).isfinite().any()
+
+
+def test_masked_pixels_have_no_influence():
+    template = analytic_template(40, 40)
+    mask = torch.zeros(40, 40, dtype=torch.bool)
+    mask[12:28, 10:30] = True
+    spoiled = torch.where(mask, template, 255 * torch.rand(1, 1, 40, 40))
+    wide = torch.nn.functional.max_pool2d(mask[None, None].float(), 9, 1, 4) > 0  # the gradients' own reach
+    spoiled = torch.where(wide, template, spoiled)
+    a, b = prepare(template, mask=mask), prepare(spoiled, mask=mask)
+    assert a.K.shape[-1] == int(mask.sum())
+    assert rows_agree(a.K, b.K, 0.02)
+
+
+def test_weights_scale_out_and_count():
+    template = analytic_template(30, 30)
+    ones = torch.ones(30, 30)
+    assert rows_agree(prepare(template, mask=ones).K, prepare(template, mask=5 * ones).K, 1e-4)
+    half = ones.clone()
+    half[:, 15:] = 1e-6
+    left = torch.zeros(30, 30)
+    left[:, :15] = 1
+    a = prepare(template, mask=half).K[0].double().reshape(7, 30, 30)[:, :, :15].flatten(1)
+    b = prepare(template, mask=left).K[0].double()
+    assert rows_agree(a[:3], b[:3], 1e-3)
+
+
+def test_centre_moves_the_point_that_the_pose_speaks_of():
+    """Turning about another point is turning about the middle and then moving."""
+    template = analytic_template(31, 31)
+    offset = torch.tensor([[3.0, -2.0]])
+    a, b = prepare(template), prepare(template, centre=offset)
+    gx, gy, turn = a.signal[0, :3]
+    assert torch.allclose(b.signal[0, 2], turn - gx * offset[0, 1] + gy * offset[0, 0], atol=1e-2)
+
+
+def test_radius_is_the_distance_of_the_farthest_pixel():
+    assert float(prepare(analytic_template(31, 41)).radius[0]) == pytest.approx(math.hypot(15, 20))
+
+
+def test_reweigh_equals_preparing_the_visible_part():
+    """The whole template seen through a window is the template under that window as its mask."""
+    template = analytic_template(30, 30)
+    seen = torch.zeros(30, 30, dtype=torch.bool)
+    seen[:, 8:] = True
+    part = reweigh(prepare(template, illumination="gain"), seen.reshape(1, -1))
+    middle = torch.zeros(1, 2)
+    alone = prepare(template, mask=seen, illumination="gain", centre=middle)
+    assert rows_agree(part.K[0][:, seen.flatten()], alone.K[0], 1e-3)
+    assert not part.K[0][:, ~seen.flatten()].any()
+    for name in ("slope", "spread", "inflation"):
+        a, b = getattr(part, name), getattr(alone, name)
+        assert torch.allclose(a, b, rtol=1e-3, atol=1e-3 * float(b.diagonal(dim1=1, dim2=2).amin()))

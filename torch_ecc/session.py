@@ -1,0 +1,186 @@
+"""A tracking run from a video to its files: what ``torch-ecc track`` does."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torch_ecc.calibration import Calibration
+from torch_ecc.estimate import Estimate, Status
+from torch_ecc.io import OverlayWriter, TrackWriter, open_frames
+from torch_ecc.plots import plot_track
+from torch_ecc.tracker import Tracker
+
+STATUS_NAMES = {int(code): code.name for code in Status}
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class TrackJob:
+    """Settings of a run, as in configs/track.toml and the options of ``torch-ecc track``.
+
+    ``input``: see ``io.open_frames``; ``reference``: the image to cut the templates from (default: the first frame of
+    the input, which then counts as frame 0); ``centers`` px and ``size`` px as in ``Tracker``; ``polygons``: one list
+    of (x, y) px corners per template instead of, or within, the squares; the other names are ``Tracker``'s and
+    ``Calibration``'s.
+    """
+
+    input: str
+    out: str = "torch-ecc-out"
+    reference: str | None = None
+    centers: tuple[Point, ...] = ()
+    size: int | tuple[int, int] | None = None
+    polygons: tuple[tuple[Point, ...], ...] = ()
+    criterion: str = "ecc"
+    illumination: str = "linear"
+    interpolation: str = "bspline3"
+    max_iterations: int = 15
+    tolerance: float = 1e-3
+    levels: int = 1
+    prediction: str = "velocity"
+    min_score: float = 0.5
+    device: str | None = None
+    um_per_px: float | Point | None = None
+    axis_angle_deg: float = 0.0
+    fps: float | None = None
+    overlay: bool = True
+
+    def calibration(self) -> Calibration | None:
+        """Pixels to micrometres, None if the scale is not given."""
+        if self.um_per_px is None:
+            return None
+        return Calibration(self.um_per_px, math.radians(self.axis_angle_deg))
+
+
+class Templates(NamedTuple):
+    """Centres (R, 2) px, common size (h, w) px and masks (R, h, w) or None."""
+
+    centers: Tensor
+    size: tuple[int, int]
+    mask: Tensor | None
+
+    @property
+    def shapes(self) -> list[tuple[int, int] | Tensor]:
+        """What each template covers, for drawing."""
+        return [self.size] * len(self.centers) if self.mask is None else list(self.mask)
+
+
+class Outcome(NamedTuple):
+    """What became of a run: ``frames`` done, how many each template was lost in and its last status (R,), the folder,
+    and whether it was stopped from the keyboard."""
+
+    frames: int
+    lost: Tensor
+    last_status: Tensor
+    folder: Path
+    interrupted: bool
+
+
+class Session:
+    """A checked run: the input is open, the templates are cut, and nothing is written yet.
+
+    Raises FileNotFoundError or ValueError for whatever in ``job`` does not fit.
+    """
+
+    def __init__(self, job: TrackJob) -> None:
+        self.job, self.calibration = job, job.calibration()
+        self.templates = choose_templates(job)
+        self.source = open_frames(job.input)
+        frames = iter(self.source)
+        first = next(frames) if job.reference is None else next(iter(open_frames(job.reference)))
+        self.frames = frames if job.reference else chain((first,), frames)
+        names = "criterion illumination interpolation max_iterations tolerance levels prediction device min_score"
+        options = {name: getattr(job, name) for name in names.split()}
+        centers, size, mask = self.templates
+        self.tracker = Tracker(first, centers, size, mask=mask, **options)
+        self.fps = job.fps if job.fps is not None else self.source.fps
+
+    def run(self, progress: Callable[[Estimate], None] = lambda estimate: None) -> Outcome:
+        """Track every frame and write DIR/track.csv, track.npz, track.png, summary.json and overlay.mp4.
+
+        ``progress`` is told each frame's estimate. Ctrl-C ends the run and keeps what it had; so does a damaged frame,
+        whose ValueError is raised again once everything before it is written.
+        """
+        folder, stopped = Path(self.job.out), None
+        lost = torch.zeros(len(self.templates.centers), dtype=torch.int64)
+        last = torch.zeros_like(lost)
+        writer, overlay = self._writers(folder)
+        try:
+            with writer, overlay:
+                for frame in self.frames:
+                    estimate = self.tracker(frame)
+                    writer.write(estimate)
+                    overlay.write(frame, estimate)
+                    last = estimate.status.cpu().long()
+                    lost += ~Status.good(last)
+                    progress(estimate)
+        except (KeyboardInterrupt, ValueError) as error:
+            stopped = error
+        if writer.frames:
+            plot_track(folder / "track.npz", folder / "track.png", title=self.source.name)
+        if isinstance(stopped, ValueError):
+            raise stopped
+        return Outcome(writer.frames, lost, last, folder, stopped is not None)
+
+    def _writers(self, folder: Path) -> tuple[TrackWriter, OverlayWriter | _NoOverlay]:
+        matrix = None
+        if self.calibration is not None:
+            matrix = self.calibration.matrix(torch.zeros(1, dtype=torch.float64))[:2, :2]
+        settings = {name: value for name, value in dataclasses.asdict(self.job).items() if value not in (None, ())}
+        writer = TrackWriter(folder, status_names=STATUS_NAMES, fps=self.fps, um_matrix=matrix, settings=settings)
+        if not self.job.overlay:
+            return writer, _NoOverlay()
+        shapes = self.templates.shapes
+        return writer, OverlayWriter(folder, shapes=shapes, status_names=STATUS_NAMES, fps=self.fps)
+
+
+class _NoOverlay(nullcontext[None]):
+    def write(self, frame: Tensor, estimate: Estimate) -> None:
+        """Nothing: the run goes without pictures."""
+
+
+def choose_templates(job: TrackJob) -> Templates:
+    """Centres, size and masks of a job; polygons bring what is not given. ValueError if that leaves something open."""
+    if not job.centers and not job.polygons:
+        raise ValueError("centers: expected at least one (x, y), or a polygon, got none")
+    if job.centers and job.polygons and len(job.centers) != len(job.polygons):
+        raise ValueError(f"polygons: expected one per center ({len(job.centers)}), got {len(job.polygons)}")
+    polygons = [np.array(polygon, dtype=np.float64) for polygon in job.polygons]
+    for number, polygon in enumerate(polygons):
+        if len(polygon) < 3 or not np.isfinite(polygon).all():
+            raise ValueError(f"polygons: polygon {number} needs three or more finite corners, got {polygon.tolist()}")
+    middles = [tuple(np.round((p.min(0) + p.max(0)) / 2)) for p in polygons]
+    centers = np.array(job.centers or middles, dtype=np.float64)
+    size = job.size
+    if size is None:
+        if not polygons:
+            raise ValueError("size: expected the side of the templates in px, got none")
+        size = 2 * math.ceil(max(np.abs(p - c).max() for p, c in zip(polygons, centers, strict=True))) + 1
+    h, w = (size, size) if isinstance(size, int) else size
+    if not polygons:
+        return Templates(torch.from_numpy(centers), (h, w), None)
+    masks = [
+        _rasterise(p, np.round(c - (w / 2 - 0.5, h / 2 - 0.5)), (h, w)) for p, c in zip(polygons, centers, strict=True)
+    ]
+    return Templates(torch.from_numpy(centers), (h, w), torch.stack(masks))
+
+
+def _rasterise(polygon: NDArray[np.float64], corner: NDArray[np.float64], size: tuple[int, int]) -> Tensor:
+    """Mask (h, w) of the pixels inside a polygon (N, 2) and on its border, ``corner`` being pixel (0, 0)."""
+    mask = np.zeros(size, dtype=np.uint8)
+    fraction_bits = 4
+    corners = np.round((polygon - corner) * 2**fraction_bits).astype(np.int32)
+    cv2.fillPoly(mask, [corners], 1, shift=fraction_bits)
+    return torch.from_numpy(mask) > 0
