@@ -64,7 +64,7 @@ def test_oblique_inverse_recovers_every_column(criterion):
 @settings(deadline=None, max_examples=15)
 @given(st.integers(0, 10**6))
 def test_ecc_step_is_evangelidis_and_psarakis_with_roles_exchanged(seed):
-    """Their closed form (2008, eq. 14) for the template's Jacobian, least-squares projections and the image as target."""
+    """Their closed form for the increment (2008), with the template's Jacobian and the image as target."""
     reference = least_squares(prepare(analytic_template(25, 25), illumination="gain"))
     generator = torch.Generator().manual_seed(seed)
     t = reference.signal[0, 3].double()

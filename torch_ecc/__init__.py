@@ -6,6 +6,7 @@ judges a patch beforehand; ``Calibration`` turns pixels into micrometres. Conven
 
 from torch_ecc import pose
 from torch_ecc.align import align
+from torch_ecc.calibration import Calibration, CalibrationFit, calibrate
 from torch_ecc.criteria import ECC, SSD, Criterion, PaperECC
 from torch_ecc.estimate import Estimate, Status, Track
 from torch_ecc.patches import texture
@@ -17,6 +18,8 @@ __version__ = "0.1.0"
 __all__ = [
     "ECC",
     "SSD",
+    "Calibration",
+    "CalibrationFit",
     "Criterion",
     "Estimate",
     "PaperECC",
@@ -26,6 +29,7 @@ __all__ = [
     "Track",
     "Tracker",
     "align",
+    "calibrate",
     "pose",
     "prepare",
     "texture",

@@ -33,13 +33,13 @@ def align(
     b, device = len(reference.K), reference.K.device
     if pose.shape != (b, 3):
         raise ValueError(f"align: pose must be ({b}, 3), one per template, got {tuple(pose.shape)}")
-    if not (pose.is_floating_point() and bool(pose.isfinite().all())):
-        raise ValueError(f"align: pose must hold finite floating-point numbers, got {pose.dtype} {pose.tolist()}")
     if len(gray) not in (1, b):
         raise ValueError(f"align: image must be one or one per template ({b}), got a batch of {len(gray)}")
     for name, value in (("image", gray), ("pose", pose)):
         if value.device != device:
             raise ValueError(f"align: {name} must be on the reference's device {device}, got {value.device}")
+    if not (pose.is_floating_point() and bool(pose.isfinite().all())):
+        raise ValueError(f"align: pose must hold finite floating-point numbers, got {pose.dtype} {pose.tolist()}")
     return solve(reference, gray, pose.to(reference.radius.dtype), settings)
 
 

@@ -84,7 +84,7 @@ def calibrate(displacement: Tensor, commanded_um: Tensor) -> CalibrationFit:
         raise ValueError("calibrate: displacements and commanded moves must be finite")
     px, um = px - px.mean(0), um - um.mean(0)
     spread = torch.linalg.svdvals(px)
-    if len(px) < 3 or spread[-1] < 1e-6 * spread[0]:
+    if len(px) < 3 or spread[-1] <= 1e-6 * spread[0]:
         raise ValueError(f"calibrate: moves must span the plane, got {len(px)} of them along one line or point")
     affine = torch.linalg.lstsq(px, um).solution.mT  # um = affine px
     angle = torch.atan2(affine[0, 1] - affine[1, 0], affine.trace())

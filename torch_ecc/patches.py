@@ -39,7 +39,10 @@ def locate_patches(where: str, frame: Tensor, centers: Centers, size: Size, mask
     """
     h, w = as_size(where, size)
     height, width = frame.shape[-2:]
-    place = torch.as_tensor(centers, dtype=pose_dtype(frame.device), device=frame.device)
+    try:
+        place = torch.as_tensor(centers, dtype=pose_dtype(frame.device), device=frame.device)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: centers must be numbers, (R, 2) as (x, y), got {centers!r}") from error
     if place.dim() != 2 or place.shape[1] != 2 or len(place) == 0:
         raise ValueError(f"{where}: centers must be (R, 2) as (x, y), got {tuple(place.shape)}")
     if not place.isfinite().all():
@@ -61,7 +64,7 @@ def locate_patches(where: str, frame: Tensor, centers: Centers, size: Size, mask
 
 def as_size(where: str, size: Size) -> tuple[int, int]:
     """(h, w) of a size given as one number or as (h, w)."""
-    pair = (size, size) if isinstance(size, int) else tuple(size)
+    pair = tuple(size) if isinstance(size, Sequence) else (size, size)
     if len(pair) != 2 or any(not isinstance(n, int) or n < SMALLEST for n in pair):
         raise ValueError(f"{where}: size must be one or two whole numbers of at least {SMALLEST} px, got {size!r}")
     return pair

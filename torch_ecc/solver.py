@@ -13,7 +13,6 @@ from torch_ecc.reference import Reference, reweigh
 from torch_ecc.sampling import Sampler, inside, make_sampler
 
 COARSE_TOLERANCE = 0.02  # px; the bilinear iterations only have to come near: their own bias is some 0.005 px
-SYNC_EVERY = 4  # iterations between looks at what has converged on an accelerator; on a CPU every one
 EDGE = 4  # px: a template nearer than this to the frame's border may cross it while iterating
 LONGEST_STEP = 0.2  # of the template's radius: a longer one left the range in which the linearisation means anything
 
@@ -102,7 +101,7 @@ def gauss_newton(reference: Reference, sample: Sampler, state: State, tolerance:
 def iterate(reference: Reference, sample: Sampler, state: State, tolerance: float, budget: int) -> State:
     """Gauss-Newton until every predicted error is below ``tolerance`` or ``budget`` iterations are spent."""
     result, index = state, torch.arange(len(state.pose), device=state.pose.device)
-    period = 1 if index.device.type == "cpu" else SYNC_EVERY
+    period = check_period(index.device)
     for k in range(1, budget + 1):
         state = gauss_newton(reference, sample, state, tolerance)
         if k < budget and k % period == 0:
@@ -114,6 +113,11 @@ def iterate(reference: Reference, sample: Sampler, state: State, tolerance: floa
                 index, state = index[busy], state.select(busy)
                 reference, sample = reference.select(busy), sample.select(busy)
     return result.merge(index, state)
+
+
+def check_period(device: torch.device) -> int:
+    """Iterations between two looks at what has converged: each look stops an accelerator, and costs a CPU nothing."""
+    return 1 if device.type == "cpu" else 4
 
 
 def refine(reference: Reference, image: Tensor, state: State, settings: Settings) -> State:

@@ -1,0 +1,62 @@
+"""Configuration files: every key known, every type checked, every default written in configs/."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from torch_ecc.config import build, read_toml
+from torch_ecc.session import TrackJob
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+
+
+def test_fills_a_job():
+    job = build(TrackJob, {"input": "a.mp4", "centers": [[1, 2.5]], "size": [31, 41], "um_per_px": 1}, "job.toml")
+    assert job.centers == ((1.0, 2.5),)
+    assert job.size == (31, 41)
+    assert job.um_per_px == 1.0
+    assert job.levels == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"centre": [[1, 2]]}, r"job.toml: unknown key 'centre' \(did you mean 'centers'\?\)"),
+        ({"zzz": 1}, r"job.toml: unknown key 'zzz' \(known keys: input, out, .*\)"),
+        ({"input": 3}, "job.toml: input must be str, got 3"),
+        ({"levels": 1.5}, "job.toml: levels must be int, got 1.5"),
+        ({"levels": True}, "job.toml: levels must be int, got True"),
+        ({"fps": "fast"}, "job.toml: fps must be float | None, got 'fast'"),
+        ({"centers": [[1, 2, 3]]}, r"job.toml: centers must have 2 values, got \[1, 2, 3\]"),
+        ({"centers": 5}, "job.toml: centers must be"),
+    ],
+)
+def test_says_what_is_wrong(values, message):
+    with pytest.raises(ValueError, match=message):
+        build(TrackJob, {"input": "a.mp4"} | values, "job.toml")
+
+
+def test_a_broken_or_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="config: no such file"):
+        read_toml(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("size = = 3")
+    with pytest.raises(ValueError, match=r"bad.toml is not valid TOML: .*line 1"):
+        read_toml(tmp_path / "bad.toml")
+
+
+def test_every_default_is_written_in_the_file():
+    """configs/track.toml, with its comment signs removed, is exactly the defaults."""
+    text = (CONFIGS / "track.toml").read_text()
+    written = tomllib.loads(re.sub(r"(?m)^#(\w+ = )", r"\1", text))
+    optional = {"reference", "polygons", "device", "um_per_px", "fps"}  # no default: an example stands there
+    job = build(TrackJob, written, "track.toml")
+    for field in dataclasses.fields(TrackJob):
+        assert field.name in written, field.name
+        if field.default is not dataclasses.MISSING and field.name not in optional | {"centers", "size"}:
+            assert getattr(job, field.name) == field.default, field.name
+    build(TrackJob, tomllib.loads(text), "track.toml")

@@ -1,0 +1,248 @@
+"""Laws of the tracker: state, prediction, loss and recovery, masks, streams, devices, memory."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import math
+import resource
+
+import pytest
+import torch
+
+from torch_ecc import SequenceError, Status, Tracker, texture
+from torch_ecc.sim.scene import PlaneWaves
+
+SCENE = PlaneWaves.random(seed=5)
+FRAME = (200, 240)
+CENTERS = [(70.0, 80.0), (150.0, 100.0), (110.4, 90.7)]
+
+
+def poses(*rows: tuple[float, float, float]) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def frames(path: torch.Tensor) -> torch.Tensor:
+    """Frames (F, H, W) uint8 of the scene on a stage that moves along ``path`` (F, 3)."""
+    return SCENE.render(path, FRAME)[:, 0].round().clamp(0, 255).to(torch.uint8)
+
+
+def rigid(path: torch.Tensor, centers=CENTERS) -> torch.Tensor:
+    """Where the points that were at ``centers`` in the first frame are: (F, R, 3)."""
+    from torch_ecc.pose import compose, inverse
+
+    start = torch.cat((torch.tensor(centers), torch.zeros(len(centers), 1)), 1).double()
+    local = compose(inverse(path[:1]), start)
+    return compose(path[:, None].expand(-1, len(centers), 3), local[None].expand(len(path), -1, 3))
+
+
+PATH = torch.stack(
+    [poses((110 + 4 * math.sin(k / 4), 95 - 3 * math.sin(k / 5), 0.05 * math.sin(k / 6)))[0] for k in range(24)]
+)
+
+
+@pytest.mark.parametrize("prediction", ["hold", "velocity"])
+@pytest.mark.parametrize("levels", [1, 2])
+def test_tracks_many_templates_of_one_frame(prediction, levels):
+    stack = frames(PATH)
+    tracker = Tracker(stack[0], CENTERS, (51, 60), prediction=prediction, levels=levels)
+    track = tracker.track_sequence(stack[1:])
+    assert track.pose.shape == (23, 3, 3)
+    assert (track.status == Status.CONVERGED).all()
+    assert (track.pose - rigid(PATH)[1:])[..., :2].abs().max() < 0.01
+    assert torch.allclose(track.displacement, track.pose - tracker.start)
+    assert track.sigma.shape == (23, 3, 3)
+
+
+def test_many_templates_give_the_single_results():
+    stack = frames(PATH)
+    generator = torch.Generator().manual_seed(0)
+    centers = torch.rand(64, 2, generator=generator) * torch.tensor([150.0, 110.0]) + 45
+    together = Tracker(stack[0], centers, 41).track_sequence(stack[1:5])
+    for r in range(0, 64, 9):
+        alone = Tracker(stack[0], centers[r : r + 1], 41).track_sequence(stack[1:5])
+        assert (together.pose[:, r] - alone.pose[:, 0]).abs().max() < 1e-4
+        assert torch.equal(together.status[:, r], alone.status[:, 0])
+
+
+def test_first_frame_is_where_it_started():
+    stack = frames(PATH)
+    estimate = Tracker(stack[0], CENTERS, 51)(stack[0])
+    assert (estimate.displacement.abs() < 1e-5).all()
+    assert (estimate.score > 0.9999).all()
+
+
+def test_track_and_call_are_the_same():
+    stack = frames(PATH)
+    a, b = (Tracker(stack[0], CENTERS, 51) for _ in range(2))
+    assert torch.equal(a.track(stack[1]).pose, b(stack[1]).pose)
+
+
+def test_colour_frames_and_grey_frames():
+    stack = frames(PATH)
+    rgb = stack[:, None].expand(-1, 3, -1, -1)
+    a = Tracker(stack[0], CENTERS, 51).track_sequence(stack[1:6])
+    b = Tracker(rgb[0], CENTERS, 51).track_sequence(rgb[1:6])
+    assert (a.pose - b.pose).abs().max() < 1e-4
+
+
+def test_streams_have_a_frame_each():
+    other = PlaneWaves.random(seed=6).render(PATH, FRAME)[:, 0].round().clamp(0, 255).to(torch.uint8)
+    pair = torch.stack((frames(PATH), other), 1)[:, :, None]  # (F, 2, 1, H, W)
+    track = Tracker(pair[0], CENTERS[:2], 51).track_sequence(pair[1:])
+    assert (track.pose - rigid(PATH, CENTERS[:2])[1:])[..., :2].abs().max() < 0.01
+
+
+def test_velocity_prediction_follows_where_hold_does_not():
+    """A turn about a far point: constant in the template's own axes, 7 px and 3 deg per frame."""
+    angle = torch.arange(12) * math.radians(3.0)
+    path = torch.stack((120 - 0 * angle, 100 - 0 * angle, angle), -1).double()
+    path[:, 0] += 0.5 * torch.arange(12) ** 1.5
+    stack = frames(path)
+    center = [(60.0, 60.0)]
+    velocity = Tracker(stack[0], center, 41, prediction="velocity").track_sequence(stack[1:])
+    hold = Tracker(stack[0], center, 41, prediction="hold").track_sequence(stack[1:])
+    assert (velocity.status == Status.CONVERGED).all()
+    assert velocity.iterations[3:].sum() < hold.iterations[3:].sum()
+
+
+@pytest.mark.parametrize("shift", [(12.0, 5.0, 0.0), (25.0, -18.0, 0.0), (-8.0, 20.0, 0.3)])
+def test_a_jump_beyond_the_basin_is_searched_for(shift):
+    stack = frames(poses((110, 95, 0), (110 + shift[0], 95 + shift[1], shift[2])))
+    center = [(110.0, 95.0)]
+    estimate = Tracker(stack[0], center, 61)(stack[1])
+    assert estimate.status == Status.CONVERGED
+    assert (estimate.displacement[0] - torch.tensor(shift)).abs().max() < 5e-3
+
+
+def hostile() -> dict[str, torch.Tensor]:
+    good = frames(PATH)[5]
+    generator = torch.Generator().manual_seed(0)
+    occluded = good.clone()
+    occluded[:, 110:] = 30
+    return {
+        "blank": torch.full_like(good, 90),
+        "saturated": torch.full_like(good, 255),
+        "dark": torch.zeros_like(good),
+        "noise": (128 + 40 * torch.randn(FRAME, generator=generator)).clamp(0, 255).to(torch.uint8),
+        "half occluded": occluded,
+        "negative": 255 - good,
+    }
+
+
+@pytest.mark.parametrize("name", hostile())
+def test_a_lost_template_keeps_its_last_good_pose_and_is_found_again(name):
+    stack = frames(PATH)
+    tracker = Tracker(stack[0], [(110.0, 95.0)], 61)
+    before = tracker.track_sequence(stack[1:5]).pose[-1]
+    for _ in range(4):
+        estimate = tracker(hostile()[name])
+        assert not Status.good(estimate.status).any()
+        assert torch.equal(estimate.pose, before)
+        assert not any(v.isnan().any() for v in estimate)
+    after = tracker(stack[8])
+    assert after.status == Status.CONVERGED
+    assert (after.pose[0] - rigid(PATH, [(110.0, 95.0)])[8, 0])[:2].abs().max() < 0.01
+
+
+def test_leaving_and_entering_the_frame():
+    x = torch.cat((torch.arange(110, 260, 6.0), torch.arange(260, 110, -6.0)))
+    path = torch.stack((x, torch.full_like(x, 95.0), torch.zeros_like(x)), -1).double()
+    track = Tracker(frames(path[:1])[0], [(110.0, 95.0)], 61).track_sequence(frames(path)[1:])
+    assert (track.status == Status.OUT_OF_VIEW).any()
+    inside = path[1:, 0] < 205
+    assert (track.status[inside] == Status.CONVERGED).all()
+    assert (track.pose[inside, 0] - path[1:][inside])[:, :2].abs().max() < 0.01
+    partly = (path[1:, 0] > 212) & (path[1:, 0] < 235) & (track.status[:, 0] == Status.CONVERGED)
+    assert partly.sum() >= 4
+    assert (track.pose[partly, 0] - path[1:][partly])[:, :2].abs().max() < 0.03
+
+
+def test_a_mask_leaves_out_what_does_not_move():
+    """A moving disc on a still background: the square takes in the background, the disc's mask does not."""
+    y, x = torch.meshgrid(torch.arange(200.0), torch.arange(240.0), indexing="ij")
+    background = PlaneWaves.random(seed=9).render(poses((0, 0, 0)), FRAME)[0, 0]
+    path = poses((110, 95, 0), (111.3, 94.2, 0.02), (112.9, 93.1, 0.05))
+    stack = []
+    for pose, image in zip(path, SCENE.render(path, FRAME)[:, 0], strict=True):
+        stack.append(torch.where((x - pose[0]) ** 2 + (y - pose[1]) ** 2 < 26**2, image, background))
+    disc = (x[:61, :61] - 30) ** 2 + (y[:61, :61] - 30) ** 2 < 22**2
+    masked = Tracker(stack[0], [(110.0, 95.0)], 61, mask=disc).track_sequence(stack[1:])
+    square = Tracker(stack[0], [(110.0, 95.0)], 61).track_sequence(stack[1:])
+    error = [(t.pose[:, 0] - path[1:])[:, :2].abs().max() for t in (masked, square)]
+    assert error[0] < 0.01
+    assert error[1] > 0.1
+
+
+def test_texture_predicts_the_scatter():
+    """Predicted sigma against the scatter of poses tracked with that noise."""
+    generator = torch.Generator().manual_seed(0)
+    still = SCENE.render(poses((110.3, 95.4, 0)), FRAME)
+    noise = 4.0
+
+    def shot() -> torch.Tensor:
+        return (still + noise * torch.randn(still.shape, generator=generator)).round().clamp(0, 255).to(torch.uint8)
+
+    centers = torch.rand(40, 2, generator=generator) * torch.tensor([150.0, 110.0]) + 45
+    predicted = texture(shot(), centers, 61, noise=noise)
+    errors = torch.stack([Tracker(shot(), centers, 61)(shot()).displacement for _ in range(8)])
+    ratio = errors.square().mean((0, 1)).sqrt() / predicted.square().mean(0).sqrt()
+    assert ((ratio > 0.85) & (ratio < 1.15)).all(), ratio
+
+
+def test_texture_says_which_patch_is_better():
+    x = torch.arange(240.0).expand(200, 240)
+    flat = torch.full(FRAME, 100.0)
+    frame = torch.where(x < 120, SCENE.render(poses((110, 95, 0)), FRAME)[0, 0], flat)
+    frame = frame + torch.randn(FRAME, generator=torch.Generator().manual_seed(0))
+    good, bad = texture(frame, [(60.0, 100.0), (190.0, 100.0)], 61)
+    assert (good[:2] < 0.02).all()
+    assert bad.isinf().all()
+
+
+def test_a_sequence_error_keeps_the_track_so_far():
+    stack = list(frames(PATH))
+    stack[7] = stack[7][:-1]
+    with pytest.raises(
+        SequenceError, match=r"frame 6: track: frame must be 1 image of 240x200 px as the first"
+    ) as caught:
+        Tracker(stack[0], CENTERS, 51).track_sequence(stack[1:])
+    assert caught.value.track.pose.shape == (6, 3, 3)
+    with pytest.raises(SequenceError) as caught:
+        Tracker(stack[0], CENTERS, 51).track_sequence(stack[7:])
+    assert caught.value.track is None
+
+
+def test_everything_moves_to_a_device(device):
+    stack = frames(PATH).to(device)
+    tracker = Tracker(stack[0], CENTERS, 51)
+    moved = Tracker(stack[0].cpu(), CENTERS, 51).to(device)
+    chosen = Tracker(stack[0].cpu(), CENTERS, 51, device=device)
+    results = [t(stack[1].cpu()) for t in (tracker, moved, chosen)]
+    for result in results:
+        assert all(value.device.type == device.type for value in result)
+        assert (result.pose - results[0].pose).abs().max() < 1e-6
+    assert torch.equal(copy.deepcopy(tracker)(stack[2]).pose, tracker(stack[2]).pose)
+
+
+def test_the_accelerator_path_gives_the_same_on_a_cpu(monkeypatch):
+    """Looking at convergence every fourth iteration only, as on an accelerator, changes nothing but the cost."""
+    stack = frames(PATH)
+    often = Tracker(stack[0], CENTERS, 51).track_sequence(stack[1:8])
+    monkeypatch.setattr("torch_ecc.solver.check_period", lambda device: 4)
+    seldom = Tracker(stack[0], CENTERS, 51).track_sequence(stack[1:8])
+    assert (often.pose - seldom.pose).abs().max() < 2e-4
+    assert torch.equal(often.iterations, seldom.iterations)
+
+
+def test_memory_stays_flat_over_a_long_stream():
+    """Peak memory of a process must not grow with the number of frames (5,000 in all, short of storing poses)."""
+    stack = frames(PATH)[:, 40:150, 50:170].contiguous()
+    tracker = Tracker(stack[0], [(60.0, 55.0)], 31, interpolation="bilinear", max_iterations=3)
+    for k in range(200):
+        tracker(stack[k % 24])
+    gc.collect()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for k in range(800):
+        tracker(stack[k % 24])
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 3_000  # kB
