@@ -14,6 +14,7 @@ from torch_ecc.solver import Settings, State, warps
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
 NOISE_SHARE = 0.8  # of the information in some direction is the template's noise: not even a good match helps
+BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
 DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
 
 
@@ -30,7 +31,8 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     power = (weight * residual * residual).sum(-1) / weight.sum(-1).clamp(min=1e-30)
     score = correlation(reference.signal[:, 3], state.patch, weight).to(pose.dtype)
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
-    covariance, fixed = pose_covariance(reference, noise, gain, pose)
+    structure = clustering(reference, residual, power)
+    covariance, fixed = pose_covariance(reference, noise, gain, pose, structure)
     good_match = (score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
     status = torch.full_like(score, Status.CONVERGED, dtype=torch.int8)
     for code, found in (  # from the least to the most telling
@@ -75,16 +77,37 @@ def noise_variance(reference: Reference, power: Tensor, gain: Tensor, sampled: f
     return power * count / (count - columns).clamp(min=1) / (gain * gain + sampled)
 
 
-def pose_covariance(reference: Reference, noise: Tensor, gain: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+def clustering(reference: Reference, residual: Tensor, power: Tensor) -> Tensor:
+    """How much more the increment scatters, (B, 3), than if the residual (B, N) of mean square ``power`` (B,) were white.
+
+    What no noise model knows (edges that the sampler rounds, light, an occluder, blur) leaves residuals that cling
+    together where the gradients are. Their effect summed block by block tells the scatter that they bring (the
+    cluster-robust sandwich); 1 where it is not more than the white one's.
+    """
+    K = reference.K[:, :3].to(residual.dtype)
+    column, row = ((reference.pixels[:2] - reference.box[:2, :1]) / BLOCK).long()
+    block = row * int(column.max() + 1) + column
+    blocks = int(block.max() + 1)
+    sums = K.new_zeros(len(K), 3, blocks).index_add_(2, block, K * residual[:, None])
+    few = blocks / max(blocks - reference.K.shape[1], 1)  # blocks are not free: the fit has made their sum zero
+    white = K.square().sum(-1) * power[:, None]
+    return (few * sums.square().sum(-1) / white.clamp(min=1e-30)).clamp(min=1.0).sqrt()
+
+
+def pose_covariance(
+    reference: Reference, noise: Tensor, gain: Tensor, pose: Tensor, structure: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of variance ``noise`` (B,), the patch
     ``gain`` (B,) times the template's contrast; and whether the texture fixes the pose, (B,) bool.
 
     Sandwich of the instrumental-variable estimate: (1 + 1 / gain^2) v S^-1 (Z~ Z~^T) S^-T, turned from the template's
-    axes to the frame's. S is freed of the template noise in it.
+    axes to the frame's. S is freed of the template noise in it. ``structure`` (B, 3): see ``clustering``.
     """
     slope, textured = information(reference, torch.minimum(noise, reference.noise.to(noise.dtype) ** 2))
     inverse, regular = safe_inverse(slope)
     local = inverse @ reference.spread @ inverse.mT * (noise * (1 + 1 / (gain * gain).clamp(min=1e-12)))[:, None, None]
+    if structure is not None:
+        local = local * structure[:, :, None] * structure[:, None, :]
     turn = torch.eye(3, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)
     turn[:, :2, :2] = rotation(pose[:, 2])
     covariance = turn @ local @ turn.mT

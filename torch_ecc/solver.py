@@ -14,6 +14,8 @@ from torch_ecc.sampling import Sampler, inside, make_sampler
 
 COARSE_TOLERANCE = 0.02  # px; the bilinear iterations only have to come near: their own bias is some 0.005 px
 EDGE = 4  # px: a template nearer than this to the frame's border may cross it while iterating
+SECANT_RANGE = 1.0  # px; steps beyond it are not stretched
+LARGEST_STRETCH = 5.0
 LONGEST_STEP = 0.2  # of the template's radius: a longer one left the range in which the linearisation means anything
 
 
@@ -45,11 +47,13 @@ class Settings:
 
 
 class State(NamedTuple):
-    """Of B templates: ``pose`` (B, 3), last ``step`` and predicted remaining ``error`` in px at the farthest pixel
-    (B,), ``iterations`` (B,) and the last sampled ``patch`` (B, N)."""
+    """Of B templates: ``pose`` (B, 3), the last increment ``delta`` (B, 3) in px at the farthest pixel and the
+    ``factor`` (B,) that it was stretched by, the predicted remaining ``error`` (B,) in px there, ``iterations`` (B,) and
+    the last sampled ``patch`` (B, N)."""
 
     pose: Tensor
-    step: Tensor
+    delta: Tensor
+    factor: Tensor
     error: Tensor
     iterations: Tensor
     patch: Tensor
@@ -57,10 +61,8 @@ class State(NamedTuple):
     @staticmethod
     def start(reference: Reference, pose: Tensor) -> State:
         """Before the first iteration."""
-        never = torch.full_like(pose[:, 0], float("inf"))
-        return State(
-            pose, never, never, torch.zeros_like(never, dtype=torch.int64), torch.zeros_like(reference.K[:, 0])
-        )
+        one, count = torch.ones_like(pose[:, 0]), torch.zeros_like(pose[:, 0], dtype=torch.int64)
+        return State(pose, torch.zeros_like(pose), one, one * torch.inf, count, torch.zeros_like(reference.K[:, 0]))
 
     def select(self, index: Tensor) -> State:
         """The state of some of the templates."""
@@ -82,20 +84,39 @@ def warps(reference: Reference, pose: Tensor) -> Tensor:
 
 def gauss_newton(reference: Reference, sample: Sampler, state: State, tolerance: float) -> State:
     """One iteration. Elements whose predicted error is below ``tolerance`` already stay as they are."""
-    pose, last = state.pose, state.step
+    pose = state.pose
     warp = warps(reference, pose)
     g = sample(warp, reference.pixels)  # I(W(p_k; x'))
     seen = reference if sample.edge is None else reweigh(reference, inside(warp, reference.pixels, sample.edge))
-    delta = seen.criterion.step(seen, g).to(pose.dtype)  # eq. (9), or a better one
-    step = torch.hypot(torch.hypot(delta[:, 0], delta[:, 1]), delta[:, 2] * reference.radius)
-    usable = step.isfinite() & (state.error > tolerance)
-    delta = delta * (LONGEST_STEP * reference.radius / step).clamp(max=1)[:, None]
-    moved = compose(pose, inverse(delta))  # eq. (10)
-    rate = torch.where(last.isfinite(), step / last, 0.5).clamp(0.05, 0.95)  # linear convergence
-    error = torch.where(usable, step * rate / (1 - rate), 0.0)
+    increment = seen.criterion.step(seen, g).to(pose.dtype)  # eq. (9), or a better one
+    lever = torch.stack((torch.ones_like(reference.radius), torch.ones_like(reference.radius), reference.radius), -1)
+    delta = increment * lever
+    length = torch.linalg.vector_norm(delta, dim=-1)
+    moving = length.isfinite() & (state.error > tolerance)
+    factor, rate = secant(state, delta, length)
+    stretch = torch.minimum(factor, LONGEST_STEP * reference.radius / length.clamp(min=1e-12))
+    moved = compose(pose, inverse(increment * stretch[:, None]))  # eq. (10)
     return State(
-        torch.where(usable[:, None], moved, pose), torch.where(usable, step, last), error, state.iterations + usable, g
+        torch.where(moving[:, None], moved, pose),
+        torch.where(moving[:, None], delta, state.delta),
+        torch.where(moving, stretch, state.factor),
+        torch.where(moving, length * stretch * rate / (1 - rate), 0.0),
+        state.iterations + moving,
+        g,
     )
+
+
+def secant(state: State, delta: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Stretch of an increment ``delta`` (B, 3) of the given ``length`` (B,), and the rate of convergence, (B,) each.
+
+    Noise in the template shortens every step by one factor, so that steps shrink in a geometric series. Two of them
+    tell its sum (the secant method on their common line). Only near the answer: far from it steps are no such series.
+    """
+    square = state.delta.square().sum(-1)
+    rate = torch.where(square > 0, length / square.sqrt(), 0.5).clamp(0.05, 0.95)
+    along = (state.delta * delta).sum(-1) / square.clamp(min=1e-30)  # = 1 - (last stretch) * (share that a step covers)
+    usable = (square > 0) & (along > 0) & (along < 0.9) & (square < SECANT_RANGE**2)
+    return torch.where(usable, (state.factor / (1 - along)).clamp(1.0, LARGEST_STRETCH), 1.0), rate
 
 
 def iterate(reference: Reference, sample: Sampler, state: State, tolerance: float, budget: int) -> State:

@@ -23,6 +23,7 @@ PREDICTIONS = ("hold", "velocity")
 SEARCH_LEVELS = 3  # pyramid levels of the second attempt for a template that was not found where it was expected
 SMALLEST_COARSE = 12  # px: a template is not halved below this side
 COARSE_TOLERANCE = 0.1  # px of a coarse level
+FAMILIAR = 0.8  # share of its last good score that a template must have to count as found by a search
 
 
 class SequenceError(ValueError):
@@ -49,6 +50,7 @@ class Tracker(nn.Module):
     pose: Tensor
     velocity: Tensor
     start: Tensor
+    score: Tensor
     tracked: Tensor
 
     def __init__(  # noqa: PLR0913 - the constructor is the list of all choices
@@ -85,6 +87,7 @@ class Tracker(nn.Module):
         self.register_buffer("start", start)
         self.register_buffer("pose", start.clone())
         self.register_buffer("velocity", torch.zeros_like(start))
+        self.register_buffer("score", torch.zeros_like(start[:, 0]))
         self.register_buffer("tracked", torch.ones_like(start[:, 0], dtype=torch.bool))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -152,7 +155,8 @@ class Tracker(nn.Module):
         scale = self.pose.new_tensor((2.0**top, 2.0**top, 1.0))
         start = best_match(self.references[top].select(lost), image, self.pose[lost] / scale) * scale
         found = self._solve(images, start, top + 1, lost)
-        better = Status.good(found.status).nonzero()[:, 0]
+        familiar = found.score >= FAMILIAR * self.score[lost]
+        better = ((found.status == Status.CONVERGED) & familiar).nonzero()[:, 0]
         chosen = Estimate(*(f[better] for f in found))
         return Estimate(*(e.index_copy(0, lost[better], c) for e, c in zip(estimate, chosen, strict=True)))
 
@@ -163,6 +167,7 @@ class Tracker(nn.Module):
             # The last step in the template's own axes: exact for a constant turn about any point of the stage.
             self.velocity = torch.where(good & self.tracked[:, None], compose(inverse(self.pose), pose), 0.0)
         self.pose, self.tracked = pose, good[:, 0]
+        self.score = torch.where(self.tracked, estimate.score, self.score)
         return estimate._replace(pose=pose, displacement=pose - self.start)
 
 
