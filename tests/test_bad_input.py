@@ -109,6 +109,7 @@ CALLS = {
     "tolerance": (lambda: tracker(tolerance=0.0), "tolerance: expected a length in px > 0, got 0"),
     "tolerance nan": (lambda: tracker(tolerance=math.nan), "tolerance: expected a length in px > 0, got nan"),
     "min_score": (lambda: tracker(min_score=2.0), "min_score: expected a number from 0 to 1, got 2"),
+    "device": (lambda: tracker(device="abacus"), "Tracker: device must be one of this machine, got 'abacus'"),
     "streams": (lambda: tracker(frame=FRAME.expand(3, 1, -1, -1)), r"one image or one per template \(1\), got 3"),
     # later frames
     "another size": (

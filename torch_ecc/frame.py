@@ -17,6 +17,17 @@ def require_tensor(where: str, name: str, value: object) -> Tensor:
     return value
 
 
+def as_device(where: str, device: torch.device | str | None) -> torch.device | None:
+    """``device`` if this machine has it, None for None. ValueError otherwise."""
+    if device is None:
+        return None
+    try:
+        return torch.zeros(1, device=device).device
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{where}: device must be one of this machine, got {str(device)!r} ({reason})") from error
+
+
 def as_gray(where: str, name: str, image: object, device: torch.device | str | None = None) -> Tensor:
     """One or many images as float32 grey levels (B, 1, H, W) on ``device``; the numbers keep the frame's own scale.
 

@@ -78,7 +78,7 @@ def noise_variance(reference: Reference, power: Tensor, gain: Tensor, sampled: f
 
 
 def clustering(reference: Reference, residual: Tensor, power: Tensor) -> Tensor:
-    """How much more the increment scatters, (B, 3), than if the residual (B, N) of mean square ``power`` (B,) were white.
+    """How much more the increment scatters, (B, 3), than with a white residual (B, N) of mean square ``power`` (B,).
 
     What no noise model knows (edges that the sampler rounds, light, an occluder, blur) leaves residuals that cling
     together where the gradients are. Their effect summed block by block tells the scatter that they bring (the

@@ -113,7 +113,8 @@ class Session:
         ``progress`` is told each frame's estimate. Ctrl-C ends the run and keeps what it had; so does a damaged frame,
         whose ValueError is raised again once everything before it is written.
         """
-        folder, stopped = Path(self.job.out), None
+        folder, done = Path(self.job.out), 0
+        stopped: BaseException | None = None
         lost = torch.zeros(len(self.templates.centers), dtype=torch.int64)
         last = torch.zeros_like(lost)
         writer, overlay = self._writers(folder)
@@ -125,14 +126,15 @@ class Session:
                     overlay.write(frame, estimate)
                     last = estimate.status.cpu().long()
                     lost += ~Status.good(last)
+                    done += 1
                     progress(estimate)
         except (KeyboardInterrupt, ValueError) as error:
             stopped = error
-        if writer.frames:
+        if done:
             plot_track(folder / "track.npz", folder / "track.png", title=self.source.name)
         if isinstance(stopped, ValueError):
             raise stopped
-        return Outcome(writer.frames, lost, last, folder, stopped is not None)
+        return Outcome(done, lost, last, folder, stopped is not None)
 
     def _writers(self, folder: Path) -> tuple[TrackWriter, OverlayWriter | _NoOverlay]:
         matrix = None

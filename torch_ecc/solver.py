@@ -48,8 +48,8 @@ class Settings:
 
 class State(NamedTuple):
     """Of B templates: ``pose`` (B, 3), the last increment ``delta`` (B, 3) in px at the farthest pixel and the
-    ``factor`` (B,) that it was stretched by, the predicted remaining ``error`` (B,) in px there, ``iterations`` (B,) and
-    the last sampled ``patch`` (B, N)."""
+    ``factor`` (B,) that it was stretched by, the predicted remaining ``error`` (B,) in px there, ``iterations`` (B,)
+    and the last sampled ``patch`` (B, N)."""
 
     pose: Tensor
     delta: Tensor

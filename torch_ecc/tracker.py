@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from torch_ecc.align import solve
-from torch_ecc.criteria import Criterion, make_criterion
+from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.estimate import Estimate, Status, Track
-from torch_ecc.frame import as_gray
+from torch_ecc.frame import as_device, as_gray
 from torch_ecc.patches import Centers, Patches, Size, cut, halve_patches, locate_patches
 from torch_ecc.pose import compose, inverse
 from torch_ecc.reference import Reference
@@ -76,7 +76,7 @@ class Tracker(nn.Module):
         self.settings = Settings(interpolation, max_iterations, tolerance, min_score)
         self.prediction = prediction
         chosen = make_criterion(criterion, illumination)
-        gray = as_gray("Tracker", "frame", frame, device)
+        gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape = tuple(gray.shape)
         with torch.no_grad():
             patches = locate_patches("Tracker", gray, centers, size, mask)
@@ -87,7 +87,7 @@ class Tracker(nn.Module):
         self.register_buffer("start", start)
         self.register_buffer("pose", start.clone())
         self.register_buffer("velocity", torch.zeros_like(start))
-        self.register_buffer("score", torch.zeros_like(start[:, 0]))
+        self.register_buffer("score", expected_score(self.references[0]).to(start.dtype))
         self.register_buffer("tracked", torch.ones_like(start[:, 0], dtype=torch.bool))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -180,6 +180,13 @@ def pyramid(frame: Tensor, patches: Patches, criterion: Criterion, levels: int) 
             break
         references.append(cut(frame, patches, criterion))
     return references
+
+
+def expected_score(reference: Reference) -> Tensor:
+    """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
+    _, norm = centred(reference.signal[:, 3], reference.weight)
+    power = norm.square() / reference.weight.sum(-1)
+    return (1 - reference.noise.square() / power).clamp(min=0.0)
 
 
 def _check_levels(levels: int, size: tuple[int, int]) -> None:

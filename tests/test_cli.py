@@ -1,0 +1,218 @@
+"""The command line as a user meets it: outputs, words, exit status, interruption, wrong input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from torch_ecc.cli import app, main
+from torch_ecc.session import Session, TrackJob
+from torch_ecc.sim.waves import PlaneWaves
+
+SCENE = PlaneWaves.random(seed=2)
+POSES = torch.stack(
+    [torch.tensor([80 + 3 * math.sin(k / 3), 60 - 2 * math.sin(k / 4), 0.03 * k]) for k in range(10)]
+).double()
+
+
+def stack() -> np.ndarray:
+    frames = SCENE.render(POSES, (120, 160))[:, 0]
+    return frames.round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+@pytest.fixture
+def video(tmp_path):
+    np.save(tmp_path / "video.npy", stack())
+    return tmp_path / "video.npy"
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "torch_ecc", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_track_writes_everything(video, tmp_path):
+    out = tmp_path / "out"
+    options = ("--center", 80, 60, "--center", 75.5, 64, "--size", 41, "--um-per-px", 0.25, "--fps", 100)
+    done = run("track", video, *options, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "Tracked 10 frames" in done.stdout
+    assert sorted(p.name for p in out.iterdir()) == [
+        "overlay.mp4",
+        "summary.json",
+        "track.csv",
+        "track.npz",
+        "track.png",
+    ]
+    with (out / "track.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 20
+    last = rows[-2]
+    assert abs(float(last["x_px"]) - float(POSES[9, 0] + 80 - POSES[0, 0])) < 0.3
+    assert float(last["time_s"]) == pytest.approx(0.09)
+    assert float(last["dx_um"]) == pytest.approx(0.25 * float(last["dx_px"]), abs=1e-6)
+    assert abs(float(last["theta_rad"]) - 0.27) < 1e-3
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["complete"] is True
+    assert summary["frames"] == 10
+    with np.load(out / "track.npz") as track:
+        assert track["covariance"].shape == (10, 2, 3, 3)
+
+
+def test_a_lost_template_is_reported_in_words(tmp_path):
+    frames = stack()
+    frames[6:] = 90
+    np.save(tmp_path / "video.npy", frames)
+    result = CliRunner().invoke(
+        app,
+        [
+            "track",
+            str(tmp_path / "video.npy"),
+            "--center",
+            "80",
+            "60",
+            "--size",
+            "41",
+            "--out",
+            str(tmp_path / "o"),
+            "--no-overlay",
+        ],
+    )
+    assert result.exit_code == 0
+    assert "Template 0 was not found in 4 of 10 frames" in result.output
+    assert not (tmp_path / "o" / "overlay.mp4").exists()
+
+
+def test_settings_from_a_file_and_options_win(video, tmp_path):
+    config = tmp_path / "job.toml"
+    config.write_text(f'input = "{video}"\ncenters = [[80, 60]]\nsize = 31\nout = "{tmp_path}/a"\noverlay = false\n')
+    result = CliRunner().invoke(
+        app, ["track", "--config", str(config), "--size", "41x31", "--out", str(tmp_path / "b")]
+    )
+    assert result.exit_code == 0, result.output
+    assert not (tmp_path / "a").exists()
+    assert json.loads((tmp_path / "b" / "summary.json").read_text())["settings"]["size"] == [31, 41]
+
+
+def wrong(tmp_path) -> dict[str, tuple[list[str], str]]:
+    video = str(tmp_path / "video.npy")
+    good = [video, "--center", "80", "60", "--size", "41"]
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "mixed").mkdir()
+    for k, size in enumerate(((120, 160), (120, 161))):
+        cv2.imwrite(
+            str(tmp_path / "mixed" / f"f{k}.png"), np.random.default_rng(0).integers(0, 255, size).astype(np.uint8)
+        )
+    (tmp_path / "broken.mp4").write_bytes(b"no video at all" * 100)
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "bad.toml").write_text("sise = 3\n")
+    np.save(tmp_path / "line.npy", np.zeros(5))
+    nan = stack().astype(np.float32)
+    nan[0, 60, 80] = np.nan
+    np.save(tmp_path / "nan.npy", nan)
+    return {
+        "no input": ([], "INPUT is missing"),
+        "missing file": (["none.mp4", *good[1:]], "no such file"),
+        "empty folder": ([str(tmp_path / "empty"), *good[1:]], "empty"),
+        "no match": (["zzz*.png", *good[1:]], "no file matches"),
+        "broken video": ([str(tmp_path / "broken.mp4"), *good[1:]], "broken.mp4"),
+        "unknown extension": ([str(tmp_path / "notes.txt"), *good[1:]], "'.txt', which is not known"),
+        "not a stack": ([str(tmp_path / "line.npy"), *good[1:]], "line.npy"),
+        "nan": ([str(tmp_path / "nan.npy"), *good[1:]], "must be finite"),
+        "no camera": (["97", *good[1:]], "camera 97"),
+        "no center": ([video, "--size", "41"], "expected at least one"),
+        "no size": ([video, "--center", "80", "60"], "size: expected the side of the templates"),
+        "size word": ([*good[:4], "--size", "large"], "size: expected a number of px or WxH, got 'large'"),
+        "size negative": ([*good[:4], "--size", "-3"], "size: expected a number of px or WxH, got '-3'"),
+        "outside": ([video, "--center", "10", "60", "--size", "41"], "must lie in the frame of 160x120 px"),
+        "polygon": ([video, "--polygon", "1,2 3"], "polygon: expected corners as 'X,Y X,Y ...' in px"),
+        "polygon of two": ([video, "--polygon", "1,2 3,4"], "needs three or more finite corners"),
+        "polygons": (
+            [*good, "--polygon", "1,2 3,4 5,1", "--polygon", "1,2 3,4 5,1"],
+            r"expected one per center (1), got 2",
+        ),
+        "zero scale": ([*good, "--um-per-px", "0"], "um_per_px: expected one or two finite numbers other than 0"),
+        "zero fps": ([*good, "--fps", "0"], "fps must be a positive number"),
+        "criterion": ([*good, "--criterion", "magic"], "criterion: expected one of"),
+        "levels": ([*good, "--levels", "9"], "levels: expected 1 to 2"),
+        "device": ([*good, "--device", "abacus"], "device"),
+        "config": ([*good, "--config", str(tmp_path / "bad.toml")], "unknown key 'sise' (did you mean 'size'?)"),
+        "no config": ([*good, "--config", str(tmp_path / "none.toml")], "config: no such file"),
+        "reference size": ([*good, "--reference", str(tmp_path / "mixed" / "f1.png")], "must be 1 image of 161x120 px"),
+        "out is a file": ([*good, "--out", str(tmp_path / "notes.txt")], "notes.txt"),
+        "mixed sizes": ([str(tmp_path / "mixed"), *good[1:]], "161 x 120"),
+    }
+
+
+def test_wrong_input_is_one_line_and_leaves_nothing(video, tmp_path, monkeypatch, capsys):
+    cases = wrong(tmp_path)
+    assert len(cases) >= 25
+    for name, (arguments, message) in cases.items():
+        out = tmp_path / "out" / name.replace(" ", "-")
+        extra = [] if "--out" in arguments else ["--out", str(out)]
+        monkeypatch.setattr(sys, "argv", ["torch-ecc", "track", *arguments, *extra])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        said = capsys.readouterr().err
+        assert caught.value.code == 2, name
+        assert message in said, (name, said)
+        assert "Traceback" not in said, name
+        if name != "mixed sizes":  # there the first frame was good, and is kept
+            assert not out.exists(), name
+        else:
+            assert json.loads((out / "summary.json").read_text())["complete"] is False
+
+
+def test_a_damaged_frame_keeps_what_came_before(tmp_path):
+    for k, frame in enumerate(stack()):
+        cv2.imwrite(str(tmp_path / f"f{k}.png"), frame if k < 7 else frame[:-1])
+    job = TrackJob(str(tmp_path / "f*.png"), out=str(tmp_path / "o"), centers=((80.0, 60.0),), size=41)
+    with pytest.raises(ValueError, match=r"frame 7: .*160 x 119 px"):
+        Session(job).run()
+    summary = json.loads((tmp_path / "o" / "summary.json").read_text())
+    assert summary["complete"] is False
+    assert summary["frames"] == 7
+    assert (tmp_path / "o" / "track.png").exists()
+    assert not list((tmp_path / "o").glob("*.part"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_interrupting_keeps_what_was_done(tmp_path):
+    np.save(tmp_path / "long.npy", np.tile(stack(), (400, 1, 1)))
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "torch_ecc", "track", str(tmp_path / "long.npy")]
+    command += ["--center", "80", "60", "--size", "41", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    part = out / "track.csv.part"
+    while time.monotonic() < deadline and not (part.exists() and part.stat().st_size > 4000):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Stopped from the keyboard after" in said
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["complete"] is False
+    assert 10 < summary["frames"] < 4000
+    assert not list(out.glob("*.part"))
+
+
+def test_help_is_quick_and_names_the_commands():
+    started = time.perf_counter()
+    shown = run("--help")
+    assert time.perf_counter() - started < 20
+    assert shown.returncode == 0
+    assert "demo" in shown.stdout
+    assert "track" in shown.stdout

@@ -1,0 +1,63 @@
+"""The README's code runs as it stands and says what it says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import torch
+
+import torch_ecc as te
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def test_the_example_runs(capsys):
+    names: dict[str, object] = {}
+    exec(BLOCKS[0], names)
+    assert "The pose is good to the requested tolerance." in capsys.readouterr().out
+    path, estimate = names["path"], names["estimate"]
+    expected = te.pose.compose(
+        path[-1], te.pose.compose(te.pose.inverse(path[0]), torch.tensor([340.0, 260.0, 0.0]).double())
+    )
+    assert (estimate.pose[0] - expected)[:2].abs().max() < 0.02
+
+
+def test_the_library_block_runs():
+    names: dict[str, object] = {}
+    exec(BLOCKS[0], names)
+    frames = names["frames"]
+    names |= {"templates": frames[:1, None, 200:321, 280:401], "images": frames[1:2, None]}
+    names["start"] = torch.tensor([[340.0, 260.0, 0.0]], dtype=torch.float64)
+    exec(BLOCKS[1], names)
+    assert names["track"].pose.shape == (30, 1, 3)
+
+
+def test_first_screen():
+    """One sentence, one picture, the two commands and an example before anything else."""
+    first = README[: README.index("## ")]
+    assert "pip install . && torch-ecc demo" in first
+    assert 'pip install ".[dev]" && pytest' in first
+    assert len([line for line in BLOCKS[0].splitlines() if line.strip()]) <= 12
+    picture = re.search(r"!\[.*?\]\((.*?)\)", first).group(1)
+    assert (Path(__file__).parents[1] / picture).is_file()
+
+
+def test_names_and_options_exist():
+    for name in re.findall(r"te\.([A-Za-z_]+)", README):
+        assert hasattr(te, name), name
+    import click
+
+    from torch_ecc.cli import app
+
+    options = {o for command in app.commands.values() for p in command.params for o in (*p.opts, *p.secondary_opts)}
+    for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL):
+        for option in re.findall(r" (--[a-z-]+)", block):
+            assert option in options, option
+    assert isinstance(app, click.Group)
+
+
+def test_every_status_is_explained():
+    for status in te.Status:
+        assert f"`{status.name}`" in README
