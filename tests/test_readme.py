@@ -45,7 +45,7 @@ def test_first_screen():
 
 
 def test_names_and_options_exist():
-    for name in re.findall(r"te\.([A-Za-z_]+)", README):
+    for name in re.findall(r"\bte\.([A-Za-z_]+)", README):
         assert hasattr(te, name), name
     import click
 

@@ -44,7 +44,7 @@ def test_steepest_descent_images_are_the_derivative_of_the_warped_scene(size):
     def warped(delta):
         return SCENE.value(transform(delta, points))
 
-    exact = torch.autograd.functional.jacobian(warped, torch.zeros(3, dtype=torch.float64))  # (N, 3)
+    exact = torch.func.jacfwd(warped)(torch.zeros(3, dtype=torch.float64))  # (N, 3)
     G = prepare(analytic_template(*size)).signal[0, :3].T.double()
     inner = (points.abs() < torch.tensor([size[1] / 2 - 5, size[0] / 2 - 5])).all(-1)
     error = (G - exact)[inner].square().mean(0).sqrt() / exact.square().mean(0).sqrt()

@@ -37,7 +37,7 @@ def demo(out: str, frames: int) -> None:
     with progress_bar("demo") as advance:
         result = run_demo(Path(out), frames, advance)
     console.print(result.table())
-    console.print(f"Pictures and poses are in {out}/: start with {out}/demo.png and {out}/ecc/overlay.mp4")
+    console.print(f"In {out}/: demo.png, and track.png, overlay.mp4, track.csv ... of each method in ecc/ and ssd/")
 
 
 @app.command(context_settings={"show_default": False})

@@ -43,24 +43,24 @@ class DemoResult(NamedTuple):
     lost: dict[str, int]
 
     def table(self) -> Table:
-        """Errors beside the paper's largest ones under uneven light (Fig. 3)."""
-        table = Table(title="Errors against the exact motion: rms (largest)", title_justify="left")
-        for name in ("method", "x, px", "y, px", "theta, deg", "x, nm", "y, nm", "paper: largest", "lost frames"):
-            table.add_column(name, justify="left" if name == "method" else "right")
+        """Errors beside the paper's largest ones under uneven light (Fig. 3); 80 columns."""
+        table = Table(title=f"Errors against the exact motion ({UM_PER_PX:g} um per px)", title_justify="left")
+        for name in ("", "", "x px", "y px", "theta deg", "x nm", "y nm"):
+            table.add_column(name, justify="right" if name else "left")
         for method, error in self.errors.items():
-            rms, most = error.square().mean(0).sqrt(), error.abs().amax(0)
-            pairs = [f"{a:.4f} ({b:.4f})" for a, b in zip(in_degrees(rms), in_degrees(most), strict=True)]
-            nm = [
-                f"{1e3 * UM_PER_PX * a:.1f} ({1e3 * UM_PER_PX * b:.1f})" for a, b in zip(rms[:2], most[:2], strict=True)
-            ]
-            paper = "{:g} px, {:g} deg".format(*PAPER[method])
-            table.add_row(method, *pairs, *nm, paper, str(self.lost[method]))
+            px, deg = PAPER[method]
+            lost = f"{self.lost[method]} lost" if self.lost[method] else ""
+            table.add_row(method, "rms", *_cells(error.square().mean(0).sqrt()))
+            table.add_row(lost, "largest", *_cells(error.abs().amax(0)))
+            table.add_row("", "paper, largest", *_cells(torch.tensor((px, px, math.radians(deg)))), end_section=True)
         return table
 
 
-def in_degrees(pose: Tensor) -> list[float]:
-    """(3,) px, px, rad -> [px, px, deg]."""
-    return [float(pose[0]), float(pose[1]), math.degrees(float(pose[2]))]
+def _cells(pose: Tensor) -> list[str]:
+    """(3,) px, px, rad as px, px, deg, nm, nm."""
+    x, y, theta = pose.tolist()
+    nm = 1e3 * UM_PER_PX
+    return [f"{x:.4f}", f"{y:.4f}", f"{math.degrees(theta):.4f}", f"{nm * x:.1f}", f"{nm * y:.1f}"]
 
 
 def run_demo(out: Path, frames: int, advance: Callable[[int, int], None]) -> DemoResult:

@@ -22,7 +22,8 @@ Colour: TypeAlias = tuple[int, int, int]
 
 WHITE: Colour = (245, 245, 245)
 _DARK: Colour = (20, 20, 20)
-_SMALLEST, _SHIFT = 400, 4  # smaller frames are enlarged; lines are placed to 1/16 px
+_SMALLEST = 400  # px: smaller frames are enlarged
+_SHIFT, _FAR = 4, 1 << 20  # lines are placed to 1/16 px, up to where OpenCV's integers end
 
 
 class Box(NamedTuple):
@@ -60,19 +61,26 @@ class Stretch(NamedTuple):
         if pixels.dtype != np.uint8:
             scaled = (pixels.astype(np.float32) - self.low) * (255.0 / (self.high - self.low))
             pixels = np.nan_to_num(scaled).clip(0, 255).round().astype(np.uint8)
-        planes = pixels[None] if pixels.ndim == 2 else pixels
-        return np.ascontiguousarray(np.moveaxis(planes[::-1] if len(planes) == 3 else planes[[0, 0, 0]], 0, -1))
+        planes = (
+            [pixels] * 3 if pixels.ndim == 2 else [pixels[k] for k in ((2, 1, 0) if len(pixels) == 3 else (0,) * 3)]
+        )
+        return np.asarray(cv2.merge(planes), np.uint8)
 
 
 class Canvas:
-    """``image`` is (h, w, 3) uint8; ``scale`` sizes lines and letters, 1 for 480 px; ``gap`` is the usual distance."""
+    """``image`` is (h, w, 3) uint8; ``scale`` sizes lines and letters, 1 for 480 px; ``gap`` is the usual distance.
+
+    ``step`` is the length in frame px of what is 1 px long at a scale of 1.
+    """
 
     def __init__(self, picture: NDArray[np.uint8]) -> None:
         shortest = min(picture.shape[:2])
         self._zoom = ceil(_SMALLEST / shortest)
-        self.image = np.ascontiguousarray(picture.repeat(self._zoom, 0).repeat(self._zoom, 1))
+        zoomed = picture.repeat(self._zoom, 0).repeat(self._zoom, 1) if self._zoom > 1 else picture
+        self.image = np.ascontiguousarray(zoomed)
         self.scale = max(1.0, shortest * self._zoom / 480)
         self.gap = round(3 * self.scale)
+        self.step = self.scale / self._zoom
 
     def place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Frame pixels to canvas pixels, (..., 2): both count from the middle of their first pixel."""
@@ -81,7 +89,7 @@ class Canvas:
 
     def line(self, points: NDArray[np.float64], colour: Colour, *, closed: bool = False, width: float = 1.0) -> None:
         """A line through (N, 2) frame points, with a dark rim that keeps it visible on any texture."""
-        fixed = np.round(self.place(points) * (1 << _SHIFT)).astype(np.int32)[:, None]
+        fixed = np.round(self.place(points) * (1 << _SHIFT)).clip(-_FAR, _FAR).astype(np.int32)[:, None]
         thickness = max(1, round(width * self.scale))
         rim = thickness + 2 * max(1, round(0.6 * self.scale))
         for shade, size in ((_DARK, rim), (colour, thickness)):
@@ -92,17 +100,20 @@ class Canvas:
         right, bottom = _DRAW.multiline_textbbox((0, 0), text, self._font(), spacing=self.gap)[2:]
         return ceil(right) + 4 * self.gap, ceil(bottom) + 2 * self.gap
 
-    def label(self, x: int, y: int, text: str, colour: Colour) -> None:
-        """``text`` on dark ground, an edge of ``colour``; its top left at (x, y) canvas px or the nearest inside."""
-        (w, h), pad = self.measure(text), self.gap
+    def clamp(self, box: Box) -> Box:
+        """The box moved to where all of it is on the canvas, as far as that is large enough."""
         height, width = self.image.shape[:2]
-        x, y = max(0, min(x, width - w)), max(0, min(y, height - h))
-        ground = self.image[y : y + h, x : x + w]
+        return box._replace(x=max(0, min(box.x, width - box.w)), y=max(0, min(box.y, height - box.h)))
+
+    def label(self, spot: Box, text: str, colour: Colour) -> None:
+        """``text`` on dark ground with an edge of ``colour``, at a ``spot`` of the canvas as large as ``measure``."""
+        ground = self.image[spot.y : spot.y + spot.h, spot.x : spot.x + spot.w]
         ink = Image.new("L", (ground.shape[1], ground.shape[0]))
-        ImageDraw.Draw(ink).multiline_text((3 * pad, pad), text, 255, self._font(), spacing=pad)
+        ImageDraw.Draw(ink).multiline_text((3 * self.gap, self.gap), text, 255, self._font(), spacing=self.gap)
         alpha = np.asarray(ink, np.float32)[..., None] / 255
-        ground[:] = (1 - alpha) * (0.3 * ground) + alpha * np.array(WHITE, np.float32)
-        ground[:, :pad] = colour
+        tint = (np.array(WHITE, np.float32) + np.array(colour, np.float32)) / 2
+        ground[:] = (1 - alpha) * (0.3 * ground) + alpha * tint
+        ground[:, : self.gap] = colour
 
     def _font(self) -> ImageFont.FreeTypeFont:
         return _load_font(round(12.5 * self.scale))

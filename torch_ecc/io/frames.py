@@ -104,8 +104,9 @@ def _convert(array: Pixels, index: int) -> Pixels:
     """The same numbers as uint8, uint16 or float32: exact for integers, rounded for float64; booleans become 0, 255."""
     if array.dtype == np.bool_:
         return array.astype(np.uint8) * np.uint8(255)
-    if array.dtype in (np.uint8, np.uint16, np.float32):
-        return np.ascontiguousarray(array, array.dtype.newbyteorder("="))
+    native = array.dtype.newbyteorder("=")
+    if native in (np.uint8, np.uint16, np.float32):
+        return np.ascontiguousarray(array, native)
     with np.errstate(over="ignore"):  # what overflows becomes inf, and whoever takes the frame refuses that
         floats = array.astype(np.float32)
     if array.dtype.kind in "iu" and not np.array_equal(floats.astype(np.float64), array.astype(np.float64)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,8 +17,7 @@ from torch_ecc.pose import transform
 _COLOURS: dict[str, Colour] = {CONVERGED: (90, 225, 70), DOUBTFUL: (0, 165, 255)}
 _LOST: Colour = (70, 70, 255)
 _TRAIL: Colour = (255, 215, 90)
-_Side: TypeAlias = Literal["above", "below", "right", "left", "inside", "tag"]
-_SIDES: tuple[_Side, ...] = ("above", "below", "right", "left", "inside")
+_Side: TypeAlias = Literal["above", "below", "right", "left", "tag"]
 
 
 class Mark(NamedTuple):
@@ -69,68 +68,70 @@ def draw(canvas: Canvas, mark: Mark) -> None:
     for line in mark.outlines:
         canvas.line(mark.on_frame(line), mark.colour, closed=True, width=1.5)
     reach = float(min(torch.vstack(mark.outlines).amax(0)))
-    for axis in _cross(reach):
+    for axis in _cross(max(0.12 * reach, 4 * canvas.step)):
         canvas.line(mark.on_frame(axis), mark.colour)
 
 
-def _cross(reach: float) -> tuple[Tensor, Tensor]:
+def _cross(arm: float) -> tuple[Tensor, Tensor]:
     """The centre cross as a y line and an x line; the x line is drawn out to the right and ends in an arrow head."""
-    arm, tip = 0.15 * reach, 0.5 * reach
-    head = 0.08 * reach
+    tip, back, half = 4 * arm, 3.2 * arm, 0.6 * arm
     across = ((0.0, -arm), (0.0, arm))
-    along = ((-arm, 0.0), (tip, 0.0), (tip - head, -head), (tip, 0.0), (tip - head, head))
+    along = ((-arm, 0.0), (tip, 0.0), (back, -half), (tip, 0.0), (back, half))
     return torch.tensor(across, dtype=torch.float64), torch.tensor(along, dtype=torch.float64)
 
 
 class Labels:
-    """Where the labels go: beside their templates, on the sides that were free in the first frame.
+    """Where the labels go: beside their templates, clear of each other and of a ``reserved`` part of the canvas.
 
-    The sides stay, so that labels do not jump about; a template without a free side gets a small tag.
+    A label stays on its side while there is room, so that it does not jump about. A template without a free side gets a
+    small tag; in a crowd, where that is so for most of them at first, all do.
     """
 
-    def __init__(self, canvas: Canvas, marks: Sequence[Mark], reserved: Box) -> None:
-        boxes = [mark.box(canvas) for mark in marks]
-        taken, self._sides = [reserved], []
-        for index, mark in enumerate(marks):
-            size = canvas.measure(mark.text("above"))
-            others = boxes[:index] + boxes[index + 1 :]
-            side, spot = _choose(canvas, boxes[index], size, (taken, others))
-            self._sides.append(side)
-            taken.append(spot)
+    def __init__(self, reserved: Box) -> None:
+        self._reserved = reserved
+        self._sides: list[_Side] = []
 
     def draw(self, canvas: Canvas, marks: Sequence[Mark]) -> None:
-        """The labels of the same templates in any frame."""
-        for mark, side in zip(marks, self._sides, strict=True):
+        """The labels of the same templates as in the frames before."""
+        sides = self._place(canvas, marks, self._sides or ["above"] * len(marks))
+        if not self._sides and 2 * sides.count("tag") > len(marks):
+            sides = ["tag"] * len(marks)
+        self._sides = sides
+        for mark, side in zip(marks, sides, strict=True):
             text = mark.text(side)
-            spot = _spot(side, mark.box(canvas), canvas.measure(text), canvas.gap)
-            canvas.label(spot.x, spot.y, text, mark.colour)
+            box, size = mark.box(canvas), canvas.measure(text)
+            spot = Box(box.x, box.y - size[1], *size) if side == "tag" else _spots(canvas, box, size)[side]
+            canvas.label(canvas.clamp(spot), text, mark.colour)
+
+    def _place(self, canvas: Canvas, marks: Sequence[Mark], before: Sequence[_Side]) -> list[_Side]:
+        boxes = [mark.box(canvas) for mark in marks]
+        labels, sides = [self._reserved], list[_Side]()
+        for index, (mark, side) in enumerate(zip(marks, before, strict=True)):
+            spots = _spots(canvas, boxes[index], canvas.measure(mark.text("above")))
+            sides.append("tag" if side == "tag" else _choose(spots, side, labels, boxes))
+            if sides[-1] != "tag":
+                labels.append(spots[sides[-1]])
+        return sides
 
 
-def _choose(
-    canvas: Canvas, box: Box, size: tuple[int, int], around: tuple[Sequence[Box], Sequence[Box]]
-) -> tuple[_Side, Box]:
-    """The side that hides least of the other templates, among those clear of the labels so far and of the edges."""
-    labels, templates = around
-    height, width = canvas.image.shape[:2]
-    best: tuple[int, _Side, Box] | None = None
-    for side in _SIDES:
-        spot = _spot(side, box, size, canvas.gap)
-        clear = spot.overlap(Box(0, 0, width, height)) == spot.w * spot.h and not any(map(spot.overlap, labels))
-        fits = side != "inside" or (box.w > 2 * spot.w and box.h > 4 * spot.h)
-        hidden = sum(map(spot.overlap, templates))
-        if clear and fits and (best is None or hidden < best[0]):
-            best = hidden, side, spot
-    return best[1:] if best else ("tag", _spot("tag", box, (size[0] // 8, size[1] // 2), canvas.gap))
+def _choose(spots: Mapping[_Side, Box], before: _Side, labels: Sequence[Box], templates: Sequence[Box]) -> _Side:
+    """The side, clear of other labels, that hides least of the templates; changing sides must be worth it."""
+    costs: dict[_Side, float] = {"tag": 0.35}
+    for side, spot in spots.items():
+        if not any(map(spot.overlap, labels)):
+            hidden = max(spot.overlap(box) / max(box.w * box.h, 1) for box in templates)
+            costs[side] = 10 * hidden + (0.1 if side != before else 0.0)
+    return min(costs, key=lambda side: costs[side])
 
 
-def _spot(side: _Side, box: Box, size: tuple[int, int], gap: int) -> Box:
+def _spots(canvas: Canvas, box: Box, size: tuple[int, int]) -> dict[_Side, Box]:
+    """Where a label of a template in ``box`` may go, moved to be on the canvas."""
     w, h = size
-    corner = {
+    gap = canvas.gap
+    corners: dict[_Side, tuple[int, int]] = {
         "above": (box.x, box.y - h - gap),
         "below": (box.x, box.y + box.h + gap),
         "right": (box.x + box.w + gap, box.y),
         "left": (box.x - w - gap, box.y),
-        "inside": (box.x + gap, box.y + gap),
-        "tag": (box.x, box.y),
     }
-    return Box(*corner[side], w, h)
+    return {side: canvas.clamp(Box(*corner, w, h)) for side, corner in corners.items()}

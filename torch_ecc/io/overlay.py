@@ -37,8 +37,8 @@ class OverlayWriter:
 
     ``shapes`` is what each of the R templates covers: its (h, w), or its mask (h, w). Green is converged, orange
     doubtful, red lost; the arrow is the template's x axis, the thin line its recent path. ``fps`` in Hz is the pace of
-    the video (25 if None). PNG frames in the folder overlay come instead if ``as_frames``, or if this machine's OpenCV cannot
-    write one. Frames that are not 8-bit are stretched by the grey levels of the first one.
+    the video (25 if None). If ``as_frames``, or if this machine's OpenCV cannot write a video, PNG frames come instead,
+    in the folder overlay. Frames that are not 8-bit are stretched by the grey levels of the first one.
 
     The result has ``.part`` in its name until the run ends, by itself, by an exception or by Ctrl-C. Afterwards
     ``path`` is where it is, None if no frame came.
@@ -71,13 +71,13 @@ class OverlayWriter:
         stretch = self._run.stretch if self._run else Stretch.of(frame)
         marks = self._marks(record)
         canvas = Canvas(stretch.apply(frame))
-        run = self._run = self._run or self._begin(frame, stretch, canvas, marks)
+        run = self._run = self._run or self._begin(frame, stretch, canvas)
         if frame.shape != run.shape:
             raise ValueError(f"write: frame must be {tuple(run.shape)} as before, got {tuple(frame.shape)}")
         for mark in marks:
             draw(canvas, mark)
         run.labels.draw(canvas, marks)
-        canvas.label(*self._footer(canvas)[:2], self._clock(), WHITE)
+        canvas.label(self._footer(canvas), self._clock(), WHITE)
         run.sink.write(canvas.image)
         self._frames += 1
 
@@ -91,11 +91,10 @@ class OverlayWriter:
         if run is not None:
             self.path = run.sink.close()
 
-    def _begin(self, frame: Tensor, stretch: Stretch, canvas: Canvas, marks: Sequence[Mark]) -> _Run:
+    def _begin(self, frame: Tensor, stretch: Stretch, canvas: Canvas) -> _Run:
         height, width = canvas.image.shape[:2]
-        labels = Labels(canvas, marks, self._footer(canvas))
         sink = open_sink(self.out_dir, (height, width), fps=self._fps, as_frames=self._as_frames)
-        return _Run(frame.shape, stretch, labels, sink)
+        return _Run(frame.shape, stretch, Labels(self._footer(canvas)), sink)
 
     def _marks(self, record: Record) -> list[Mark]:
         arrays = to_arrays(record)

@@ -1,0 +1,441 @@
+"""Reading: every medium gives back the pixels that went in, one frame at a time, and says in words what is wrong."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torch_ecc.io import FrameError, FrameSource, open_frames
+
+DTYPES = [np.uint8, np.uint16, np.float32]
+F, H, W = 12, 10, 14
+
+
+def stack(dtype, *, channels: int = 0, count: int = F) -> np.ndarray:
+    rng = np.random.default_rng(7)
+    shape = (count, H, W, channels) if channels else (count, H, W)
+    if np.dtype(dtype).kind == "f":
+        return rng.normal(size=shape).astype(dtype)
+    return rng.integers(0, np.iinfo(dtype).max, shape, dtype=dtype, endpoint=True)
+
+
+def expected(frame: np.ndarray) -> np.ndarray:
+    return frame if frame.ndim == 2 else np.moveaxis(frame[..., :3], -1, 0)
+
+
+def assert_same(source: FrameSource, frames: np.ndarray) -> None:
+    """Bit by bit, in order, of the same dtype, twice."""
+    assert source.shape == (H, W)
+    for _ in range(2):
+        found = list(source)
+        assert len(found) == len(frames)
+        for tensor, frame in zip(found, frames, strict=True):
+            assert tensor.is_contiguous()
+            assert tensor.dtype == torch.from_numpy(frame).dtype
+            np.testing.assert_array_equal(tensor.numpy(), expected(frame))
+
+
+def save_pillow_tiff(path: Path, frames: np.ndarray, **options) -> None:
+    pages = [Image.fromarray(frame) for frame in frames]
+    pages[0].save(path, save_all=True, append_images=pages[1:], **options)
+
+
+# ---- what goes in comes out ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", [0, 1, 3, 4])
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("save", [np.save, np.savez, np.savez_compressed], ids=["npy", "npz", "npz compressed"])
+def test_array_stacks(tmp_path, save, dtype, channels):
+    frames = stack(dtype, channels=channels)
+    path = tmp_path / ("s.npy" if save is np.save else "s.npz")
+    save(path, frames)
+    source = open_frames(path)
+    assert len(source) == source.length == F
+    assert source.fps is None
+    assert_same(source, frames[..., 0] if channels == 1 else frames)
+
+
+def test_stack_with_channels_first(tmp_path):
+    frames = stack(np.uint8, channels=3)
+    np.save(tmp_path / "s.npy", np.moveaxis(frames, -1, 1).copy())
+    assert_same(open_frames(tmp_path / "s.npy"), frames)
+
+
+def test_npz_takes_the_array_named_frames(tmp_path):
+    frames = stack(np.uint8)
+    np.savez(tmp_path / "s.npz", times=np.arange(F), frames=frames)
+    assert_same(open_frames(tmp_path / "s.npz"), frames)
+
+
+@pytest.mark.parametrize("dtype", [">u2", "<u2", ">f4", ">f8", "f8", "f2", "i1", "i2", "i4", "i8", "u4", "?"])
+def test_other_dtypes_keep_their_values(tmp_path, dtype):
+    frames = np.random.default_rng(3).integers(0, 2 if dtype == "?" else 100, (3, H, W)).astype(dtype)
+    np.save(tmp_path / "s.npy", frames)
+    source = open_frames(tmp_path / "s.npy")
+    assert source.dtype == {">u2": torch.uint16, "<u2": torch.uint16, "?": torch.uint8}.get(dtype, torch.float32)
+    scale = 255 if dtype == "?" else 1
+    np.testing.assert_array_equal(torch.stack(list(source)).numpy(), frames.astype(np.float64) * scale)
+
+
+def test_integers_that_do_not_fit_are_refused(tmp_path):
+    frames = np.zeros((3, H, W), np.int64)
+    frames[1, 0, 0] = 2**24 + 1
+    np.save(tmp_path / "s.npy", frames)
+    stream = iter(open_frames(tmp_path / "s.npy"))
+    next(stream)
+    with pytest.raises(FrameError, match=r"frame 1: int64 values beyond 2\^24 do not fit float32") as caught:
+        next(stream)
+    assert caught.value.frame == 1
+
+
+@pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_adobe_deflate", "packbits"])
+@pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 0), (np.uint16, 0), (np.float32, 0), (np.uint8, 3)])
+def test_tiff_pages(tmp_path, dtype, channels, compression):
+    frames = stack(dtype, channels=channels)
+    save_pillow_tiff(tmp_path / "s.tif", frames, compression=compression)
+    source = open_frames(tmp_path / "s.tif")
+    assert len(source) == F
+    assert_same(source, frames)
+
+
+@pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 3), (np.uint16, 3), (np.uint16, 4), (np.float32, 3)])
+def test_colour_tiff_pages_keep_their_depth(tmp_path, dtype, channels):
+    """Pillow would read 16-bit colours as 8-bit ones, and no float colours at all."""
+    frames = stack(dtype, channels=channels)
+    bgr = [cv2.cvtColor(f, cv2.COLOR_RGB2BGR if channels == 3 else cv2.COLOR_RGBA2BGRA) for f in frames]
+    assert cv2.imwritemulti(str(tmp_path / "s.tiff"), bgr)
+    assert_same(open_frames(tmp_path / "s.tiff"), frames)
+
+
+def test_float64_tiff(tmp_path):
+    frames = stack(np.float64, count=3)
+    assert cv2.imwritemulti(str(tmp_path / "s.tif"), list(frames))
+    assert_same(open_frames(tmp_path / "s.tif"), frames.astype(np.float32))
+
+
+def big_endian_tiff(image: np.ndarray) -> bytes:
+    """A TIFF of one strip as instruments write it; TIFF writers at hand only write little-endian files."""
+    data = image.tobytes()
+    bits, kind = 8 * image.itemsize, {"u": 1, "i": 2, "f": 3}[image.dtype.kind]
+    tags = [(256, W), (257, H), (258, bits), (259, 1), (262, 1), (273, 8), (277, 1), (278, H), (279, len(data))]
+    entries = b"".join(struct.pack(">HHII", tag, 4, 1, value) for tag, value in [*tags, (339, kind)])
+    count = struct.pack(">H", len(tags) + 1)
+    return b"MM\0*" + struct.pack(">I", 8 + len(data)) + data + count + entries + bytes(4)
+
+
+@pytest.mark.parametrize("dtype", [">u2", ">i2", ">f4"])
+def test_big_endian_tiff(tmp_path, dtype):
+    frame = stack(np.uint16)[0].astype(dtype)
+    (tmp_path / "s.tif").write_bytes(big_endian_tiff(frame))
+    (found,) = open_frames(tmp_path / "s.tif")
+    np.testing.assert_array_equal(found.numpy(), frame)
+    assert found.dtype == (torch.uint16 if dtype == ">u2" else torch.float32)
+
+
+def test_black_and_white_tiff(tmp_path):
+    frames = stack(np.uint8) > 100
+    save_pillow_tiff(tmp_path / "s.tif", frames)
+    assert_same(open_frames(tmp_path / "s.tif"), frames * np.uint8(255))
+
+
+def test_palette_tiff_shows_its_colours(tmp_path):
+    image = Image.fromarray(stack(np.uint8, channels=3)[0]).quantize(8)
+    image.save(tmp_path / "s.tif")
+    (found,) = open_frames(tmp_path / "s.tif")
+    np.testing.assert_array_equal(found.numpy(), expected(np.asarray(image.convert("RGB"))))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "dtype", "channels"),
+    [
+        (".png", np.uint8, 0),
+        (".png", np.uint16, 0),
+        (".png", np.uint8, 3),
+        (".png", np.uint16, 3),
+        (".png", np.uint8, 4),
+        (".bmp", np.uint8, 0),
+        (".pgm", np.uint16, 0),
+        (".tif", np.float32, 0),
+        (".tif", np.uint16, 3),
+    ],
+)
+def test_image_folders_and_globs(tmp_path, suffix, dtype, channels):
+    """In natural order: 2 comes before 10. What is not an image is passed over."""
+    frames = stack(dtype, channels=channels)
+    codes = {0: None, 3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+    for index, frame in enumerate(frames):
+        picture = frame if codes[channels] is None else cv2.cvtColor(frame, codes[channels])
+        assert cv2.imwrite(str(tmp_path / f"f{index}{suffix.upper() if index % 2 else suffix}"), picture)
+    (tmp_path / "notes.txt").write_text("not an image")
+    (tmp_path / f"._f0{suffix}").write_text("not an image either")
+    assert_same(open_frames(tmp_path), frames)
+    assert_same(open_frames(str(tmp_path / "f*")), frames)
+    assert len(open_frames(tmp_path)) == F
+
+
+def test_one_image_is_a_sequence_of_one(tmp_path):
+    frames = stack(np.uint8, count=1)
+    cv2.imwrite(str(tmp_path / "f[1].png"), frames[0])
+    assert_same(open_frames(tmp_path / "f[1].png"), frames)  # a name with wildcards in it is a name first
+    assert_same(open_frames(str(tmp_path / "*.png")), frames)
+
+
+def write_video(path: Path, codec: str, count: int = 30) -> np.ndarray:
+    x = np.arange(64, dtype=np.float32)
+    ramp = np.add.outer(x[:48], x)
+    frames = np.stack([ramp + 2 * k for k in range(count)]).astype(np.uint8)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 20.0, (64, 48))
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return frames
+
+
+@pytest.mark.parametrize(("name", "codec", "loss"), [("v.mp4", "mp4v", 12), ("v.avi", "MJPG", 6), ("v.mkv", "FFV1", 0)])
+def test_video(tmp_path, name, codec, loss):
+    frames = write_video(tmp_path / name, codec)
+    source = open_frames(str(tmp_path / name))
+    assert (len(source), source.fps, source.shape, source.name) == (30, 20.0, (48, 64), name)
+    for _ in range(2):
+        found = torch.stack(list(source))
+        assert found.dtype == torch.uint8
+        assert found.shape == (30, 3, 48, 64)
+        assert np.abs(found.numpy().astype(int) - frames[:, None]).max() <= loss
+
+
+def test_video_is_rgb(tmp_path):
+    writer = cv2.VideoWriter(str(tmp_path / "v.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 20.0, (64, 48))
+    for _ in range(5):
+        writer.write(np.full((48, 64, 3), (10, 20, 230), np.uint8))  # blue, green, red
+    writer.release()
+    red, _, blue = next(iter(open_frames(tmp_path / "v.mp4")))
+    assert red.float().mean() > 200
+    assert blue.float().mean() < 40
+
+
+class FakeCamera:
+    """A camera that counts upwards and breaks at its fifth frame."""
+
+    opened = 0
+
+    def __init__(self, index: int) -> None:
+        self.index, self.count = index, 0
+        type(self).opened += 1
+
+    def isOpened(self) -> bool:
+        return self.index == 3
+
+    def get(self, _: int) -> float:
+        return 30.0
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        self.count += 1
+        return self.count < 5, np.full((4, 6, 3), self.count, np.uint8)
+
+
+@pytest.mark.parametrize("source", [3, "3", " 03 "])
+def test_camera(monkeypatch, source):
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
+    monkeypatch.setattr(FakeCamera, "opened", 0)
+    camera = open_frames(source)
+    assert (camera.length, camera.fps, camera.shape) == (None, 30.0, (4, 6))
+    with pytest.raises(TypeError, match="number of frames of camera 3 is not known"):
+        len(camera)
+    stream = iter(camera)
+    assert [int(next(stream)[0, 0, 0]) for _ in range(4)] == [1, 2, 3, 4]
+    with pytest.raises(FrameError, match="frame 4: camera 3 delivers no frame any more"):
+        next(stream)
+    assert FakeCamera.opened == 1  # opening one takes a second and resets its exposure
+
+
+# ---- memory --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz", "tif"])
+def test_memory_does_not_grow_with_the_length(tmp_path, kind):
+    frames = np.ones((100, 200, 300), np.float32)
+    path = tmp_path / f"s.{kind}"
+    if kind == "tif":
+        save_pillow_tiff(path, frames)
+    else:
+        (np.save if kind == "npy" else np.savez_compressed)(path, frames)
+    tracemalloc.start()
+    try:
+        total = sum(float(frame[0, 1]) for frame in open_frames(path))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert total == 100
+    assert peak < 8 * frames[0].nbytes  # the whole stack is 100 frames
+
+
+def test_frames_own_their_memory(tmp_path):
+    frames = stack(np.uint8)
+    np.save(tmp_path / "s.npy", frames)
+    for frame in open_frames(tmp_path / "s.npy"):
+        frame.zero_()
+    assert_same(open_frames(tmp_path / "s.npy"), frames)
+
+
+# ---- damage in the middle ------------------------------------------------------------------------------------------
+
+
+def cut(path: Path, fraction: float) -> Path:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(fraction * len(data))])
+    return path
+
+
+def read_until_damage(path: Path) -> tuple[list[np.ndarray], FrameError]:
+    found = []
+
+    def read_all() -> None:
+        for frame in open_frames(path):
+            found.append(frame.numpy())  # noqa: PERF401, those before the error are wanted
+
+    with pytest.raises(FrameError) as caught:
+        read_all()
+    return found, caught.value
+
+
+@pytest.mark.parametrize("fraction", [0.35, 0.6, 0.97])
+@pytest.mark.parametrize("kind", ["npy", "tif"])
+def test_what_comes_before_the_cut_is_kept(tmp_path, kind, fraction):
+    frames = stack(np.uint16)
+    path = tmp_path / f"s.{kind}"
+    if kind == "tif":
+        save_pillow_tiff(path, frames)
+    else:
+        np.save(path, frames)
+    found, error = read_until_damage(cut(path, fraction))
+    assert 0 < len(found) < F
+    assert error.frame == len(found)
+    assert str(error).startswith(f"frame {error.frame}: ")
+    np.testing.assert_array_equal(found, frames[: len(found)])
+
+
+def test_damaged_archive(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 255, (40, 64, 64), dtype=np.uint8)
+    path = tmp_path / "s.npz"
+    np.savez_compressed(path, frames=frames)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 200] = bytes(200)
+    path.write_bytes(data)
+    found, error = read_until_damage(path)
+    assert "the file is damaged" in str(error)
+    assert 5 < len(found) < 40
+    np.testing.assert_array_equal(found[:5], frames[:5])
+
+
+@pytest.mark.parametrize(("name", "codec"), [("v.avi", "MJPG"), ("v.mkv", "FFV1")])
+def test_cut_video(tmp_path, name, codec):
+    write_video(tmp_path / name, codec)
+    found, error = read_until_damage(cut(tmp_path / name, 0.6))
+    assert 5 < len(found) < 28
+    assert f"{name} ends here, but declares 30 frames" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("picture", "reason"),
+    [
+        (None, r"frame 2: f2.png cannot be read \(it is damaged or not an image\)"),
+        (np.zeros((H, W + 1), np.uint8), rf"frame 2: f2.png is {W + 1} x {H} px, but f0.png is {W} x {H} px"),
+        (np.zeros((H, W), np.uint16), "frame 2: f2.png is uint16, but f0.png is uint8"),
+    ],
+    ids=["damaged", "size", "depth"],
+)
+def test_a_folder_with_one_bad_image(tmp_path, picture, reason):
+    for index, frame in enumerate(stack(np.uint8, count=4)):
+        cv2.imwrite(str(tmp_path / f"f{index}.png"), frame)
+    if picture is None:
+        cut(tmp_path / "f2.png", 0.5)
+    else:
+        cv2.imwrite(str(tmp_path / "f2.png"), picture)
+    stream = iter(open_frames(tmp_path))
+    next(stream), next(stream)
+    with pytest.raises(FrameError, match=reason):
+        next(stream)
+
+
+# ---- refused at the door -------------------------------------------------------------------------------------------
+
+
+def make_bad_files(folder: Path) -> None:
+    frames = stack(np.uint8)
+    (folder / "empty").mkdir()
+    (folder / "texts").mkdir()
+    (folder / "texts" / "a.txt").write_text("a")
+    (folder / "mixed").mkdir()
+    for name in ("a.png", "a.jpg"):
+        cv2.imwrite(str(folder / "mixed" / name), frames[0])
+    (folder / "stacks").mkdir()
+    for name in ("a.tif", "b.tif"):
+        save_pillow_tiff(folder / "stacks" / name, frames)
+    for name in ("notes.txt", "bad.mp4", "bad.tif", "bad.npy", "bad.npz", "bad.png"):
+        (folder / name).write_text("nothing of the kind")
+    np.save(folder / "flat.npy", frames[0])
+    np.save(folder / "odd.npy", np.zeros((2, 7, 8, 9)))
+    np.save(folder / "none.npy", frames[:0])
+    np.save(folder / "complex.npy", frames * 1j)
+    np.save(folder / "words.npy", np.array([[["a"]]]))
+    np.save(folder / "objects.npy", np.array([[[None]]]), allow_pickle=True)
+    np.save(folder / "fortran.npy", np.asfortranarray(frames))
+    np.savez(folder / "two.npz", left=frames, right=frames)
+    np.savez(folder / "zero.npz")
+    Image.fromarray(frames[0]).save(folder / "hidden.tif", description="ImageJ=1.54f\nimages=9000\nslices=9000\n")
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "message"),
+    [
+        ("nowhere.mp4", FileNotFoundError, "no such file, folder or camera: '.*nowhere.mp4'"),
+        ("nowhere/*.png", FileNotFoundError, r"no file matches '.*nowhere/\*.png'"),
+        ("empty", ValueError, "the folder .*empty is empty"),
+        ("texts", ValueError, "no image in the folder .*texts .known: .bmp"),
+        ("*.np[yz]", ValueError, r"no image in the \d+ files that match"),
+        ("mixed", ValueError, r"several kinds of image in the folder .*mixed \(1 .jpg, 1 .png\); name one"),
+        ("stacks", ValueError, "frame 0: a.tif cannot be read .it has several pages; give a multi-page TIFF as the"),
+        ("notes.txt", ValueError, r"notes.txt has the extension '.txt', which is not known \(known: .*\.npz"),
+        ("bad.mp4", ValueError, "bad.mp4 cannot be opened as a video"),
+        ("bad.tif", ValueError, "bad.tif cannot be read as TIFF"),
+        ("bad.npy", ValueError, "bad.npy cannot be read as a numpy array"),
+        ("bad.npz", ValueError, "bad.npz cannot be read as .npz"),
+        ("bad.png", ValueError, "frame 0: bad.png cannot be read"),
+        ("flat.npy", ValueError, r"flat.npy must be \(F, H, W\), .*, got \(10, 14\)"),
+        ("odd.npy", ValueError, r"odd.npy must be .* got \(2, 7, 8, 9\)"),
+        ("none.npy", ValueError, "none.npy holds no frame"),
+        ("complex.npy", ValueError, "complex.npy must hold real numbers .* got dtype complex128"),
+        ("words.npy", ValueError, "words.npy must hold real numbers .* got dtype <U1"),
+        ("objects.npy", ValueError, "objects.npy must hold real numbers .* got dtype object"),
+        ("fortran.npy", ValueError, "fortran.npy is in Fortran order: save numpy.ascontiguousarray"),
+        ("two.npz", ValueError, r"two.npz must hold one array, or one named 'frames'; it holds \['left', 'right'\]"),
+        ("zero.npz", ValueError, r"zero.npz must hold one array, or one named 'frames'; it holds \[\]"),
+        ("hidden.tif", ValueError, r"hidden.tif is an ImageJ stack of 9000 images with 1 TIFF page"),
+    ],
+)
+def test_bad_sources(tmp_path, source, error, message):
+    make_bad_files(tmp_path)
+    with pytest.raises(error, match=message):
+        open_frames(tmp_path / source)
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "message"),
+    [
+        (-1, ValueError, "a camera index must be 0 or more, got -1"),
+        (4, ValueError, "camera 4 cannot be opened"),
+        ("", FileNotFoundError, "no such file, folder or camera: ''"),
+    ],
+)
+def test_bad_cameras(monkeypatch, source, error, message):
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
+    with pytest.raises(error, match=message):
+        open_frames(source)

@@ -1,0 +1,238 @@
+"""track.png: displacement, uncertainty, score and status of every template over time, from track.npz."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Patch
+from numpy.typing import ArrayLike, NDArray
+
+_Array: TypeAlias = NDArray[np.float64]
+
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d31", "#5e4fa2", "#444444")
+_STATUS = {"CONVERGED": "#58b98a", "MAX_ITERATIONS": "#f2a93b", "LOST": "#d6453d"}
+_OTHER_STATUS = ("#8e3b6e", "#7a7a7a", "#3d3d3d")
+_FOUND = ("CONVERGED", "MAX_ITERATIONS")  # with every other status the pose is an old one, and is not drawn
+_BINS = 1500  # more points than this per curve would only be drawn on top of each other
+_NEEDED = ("displacement", "covariance", "score", "status", "residual_rms", "status_codes", "status_names")
+_MOSAIC = "xa;yb;tc;sr;wr"  # x, y, theta beside their sigma a, b, c; score and status words beside the residual
+
+
+class _Track(NamedTuple):
+    """What is drawn: (F,) times, (F, R, 3) displacement and sigma in (um or px, um or px, deg), (F, R) the rest."""
+
+    time: _Array
+    displacement: _Array
+    sigma: _Array
+    score: _Array
+    residual: _Array
+    status: NDArray[np.int64]
+    words: list[str]
+    time_label: str
+    unit: str
+
+
+def plot_track(
+    track: str | Path | Mapping[str, ArrayLike], path: str | Path, *, title: str = "", dpi: int = 130
+) -> Path:
+    """Draw a track into ``path`` (png, or pdf or svg by its extension) and return that.
+
+    ``track`` is a track.npz, or a mapping with its arrays: displacement (F, R, 3), covariance (F, R, 3, 3), score,
+    status and residual_rms (F, R), status_codes and status_names (K,), and if there are any time_s (F,) and um_matrix
+    (2, 2), which change the axes from frames to seconds and from px to um. Bands are +-3 sigma; frames in which a
+    template was lost are left out of its curves. Long tracks are drawn as the envelope of what they pass through.
+
+    Raises FileNotFoundError, or ValueError if arrays are missing or there is no frame.
+    """
+    data = _load(track)
+    templates = data.score.shape[1]
+    figure = Figure(figsize=(12.5, 8.8 + 0.12 * min(templates, 16)), layout=ConstrainedLayoutEngine(wspace=0.04))
+    strip = 0.14 + 0.06 * min(templates, 16)
+    ratios = {"width_ratios": (2.1, 1), "height_ratios": (1, 1, 1, 0.72, strip)}
+    axes = figure.subplot_mosaic(_MOSAIC, sharex=True, gridspec_kw=ratios)
+    colours = _choose_colours(templates)
+    _draw_motion(axes, data, colours)
+    _draw_quality(axes, data, colours)
+    _draw_status(axes["w"], data)
+    for axis in axes.values():
+        _dress(axis)
+    for name in "wr":
+        axes[name].set_xlabel(data.time_label)
+    _annotate(figure, data, colours, title)
+    return _save(figure, Path(path), dpi)
+
+
+def _load(track: str | Path | Mapping[str, ArrayLike]) -> _Track:
+    if not isinstance(track, Mapping):
+        with np.load(track) as archive:
+            return _load(dict(archive))
+    arrays = {name: np.asarray(value) for name, value in track.items()}
+    missing = [name for name in _NEEDED if name not in arrays]
+    if missing:
+        raise ValueError(f"plot_track: track must have {', '.join(_NEEDED)}; missing: {', '.join(missing)}")
+    if not arrays["score"].size:
+        raise ValueError("plot_track: track must have at least one frame and template")
+    status, words = _index_words(arrays)
+    displacement, sigma = _to_units(arrays)
+    found = np.isin(status, [k for k, word in enumerate(words) if word in _FOUND])[..., None]
+    timed, micrometres = "time_s" in arrays, "um_matrix" in arrays
+    return _Track(
+        time=arrays["time_s"] if timed else np.arange(len(status), dtype=np.float64),
+        displacement=np.where(found, displacement, np.nan),
+        sigma=np.where(found, sigma, np.nan),
+        score=arrays["score"],
+        residual=arrays["residual_rms"],
+        status=status,
+        words=words,
+        time_label="time (s)" if timed else "frame",
+        unit="µm" if micrometres else "px",
+    )
+
+
+def _index_words(arrays: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], list[str]]:
+    """Status codes (F, R) as indices into the words, which keep the order of their codes."""
+    codes = arrays["status_codes"]
+    order = np.argsort(codes)
+    status = np.searchsorted(codes[order], arrays["status"])
+    return status, [str(word) for word in arrays["status_names"][order]]
+
+
+def _to_units(arrays: Mapping[str, NDArray[Any]]) -> tuple[_Array, _Array]:
+    """Displacement and sigma (F, R, 3) in (um or px, um or px, deg); sigma is nan where it is not finite."""
+    units = np.eye(3)
+    units[:2, :2] = arrays.get("um_matrix", np.eye(2))
+    units[2, 2] = np.degrees(1.0)
+    covariance = np.where(np.isfinite(arrays["covariance"]), arrays["covariance"], np.nan)
+    rotated = units @ covariance @ units.T
+    return arrays["displacement"] @ units.T, np.sqrt(np.diagonal(rotated, axis1=-2, axis2=-1))
+
+
+def _choose_colours(count: int) -> list[Any]:
+    if count <= len(_COLOURS):
+        return list(_COLOURS[:count])
+    return list(mpl.colormaps["viridis"](np.linspace(0, 1, count)))
+
+
+def _draw_motion(axes: Mapping[str, Axes], data: _Track, colours: list[Any]) -> None:
+    """Left the displacement with its band, right the sigma, which is mostly too small to see on the left."""
+    small = "nm" if data.unit == "µm" else "10⁻³ px"
+    units = ((data.unit, small), (data.unit, small), ("deg", "10⁻³ deg"))
+    for k, (symbol, (unit, sigma_unit)) in enumerate(zip(("x", "y", r"\theta"), units, strict=True)):
+        left, right = axes["xyt"[k]], axes["abc"[k]]
+        left.set_ylabel(f"${symbol}$ displacement ({unit})")
+        right.set_ylabel(rf"$\sigma_{symbol}$ ({sigma_unit})")
+        value, sigma = data.displacement[..., k], data.sigma[..., k]
+        for r, colour in enumerate(colours):
+            _band(left, data.time, value[:, r], 3 * sigma[:, r], colour)
+            _curve(left, data.time, value[:, r], colour)
+            _curve(right, data.time, 1e3 * sigma[:, r], colour)
+        _limit(left, right, value, sigma)
+
+
+def _limit(left: Axes, right: Axes, value: _Array, sigma: _Array) -> None:
+    """Axes that few frames of great uncertainty do not blow up."""
+    if not np.isfinite(sigma).any():
+        return
+    usual = float(np.nanpercentile(sigma, 99))
+    low, high = float(np.nanmin(value)) - 3 * usual, float(np.nanmax(value)) + 3 * usual
+    if high > low:
+        margin = 0.05 * (high - low)
+        left.set_ylim(low - margin, high + margin)
+        right.set_ylim(0, 1.25e3 * usual)
+
+
+def _draw_quality(axes: Mapping[str, Axes], data: _Track, colours: list[Any]) -> None:
+    axes["s"].set_ylabel("score")
+    axes["r"].set_ylabel("residual rms (grey levels)")
+    for r, colour in enumerate(colours):
+        _curve(axes["s"], data.time, data.score[:, r], colour)
+        _curve(axes["r"], data.time, data.residual[:, r], colour)
+    axes["r"].set_ylim(bottom=0)
+
+
+def _draw_status(axis: Axes, data: _Track) -> None:
+    """One row per template; a bin of many frames shows the worst of them, which has the highest code."""
+    frames, templates = data.status.shape
+    rows = np.maximum.reduceat(data.status, _starts(frames), axis=0).T
+    step = data.time[1] - data.time[0] if frames > 1 else 1.0
+    extent = (data.time[0] - step / 2, data.time[-1] + step / 2, templates - 0.5, -0.5)
+    shades = ListedColormap(list(_status_colours(data.words).values()))
+    axis.imshow(
+        rows, cmap=shades, vmin=-0.5, vmax=len(data.words) - 0.5, aspect="auto", extent=extent, interpolation="nearest"
+    )
+    axis.set_yticks(range(0, templates, max(1, -(-templates // 8))))
+    axis.set_ylabel("status")
+
+
+def _status_colours(words: list[str]) -> dict[str, str]:
+    others = [word for word in words if word not in _STATUS]
+    return {word: _STATUS.get(word) or _OTHER_STATUS[others.index(word) % len(_OTHER_STATUS)] for word in words}
+
+
+def _curve(axis: Axes, time: _Array, values: _Array, colour: Any) -> None:
+    if len(time) > 2 * _BINS:
+        starts = _starts(len(time))
+        values = np.stack((np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)), -1).ravel()
+        time = np.repeat(time[starts], 2)
+    # A point between two gaps makes no line: short tracks show their frames as dots, too.
+    axis.plot(time, values, color=colour, lw=1.1, marker="." if len(time) <= 120 else None, ms=4)
+
+
+def _band(axis: Axes, time: _Array, middle: _Array, half: _Array, colour: Any) -> None:
+    low, high = middle - half, middle + half
+    if len(time) > 2 * _BINS:
+        starts = _starts(len(time))
+        time, low, high = time[starts], np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
+    axis.fill_between(time, low, high, color=colour, alpha=0.25, lw=0)
+
+
+def _starts(count: int) -> NDArray[np.int64]:
+    """First frames of the bins of a long track."""
+    return np.arange(0, count, -(-count // _BINS))
+
+
+def _dress(axis: Axes) -> None:
+    strip = bool(axis.images)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=9.5)
+    axis.margins(x=0.01)
+    if not strip:
+        axis.grid(color="#dddddd", lw=0.6)
+        axis.ticklabel_format(axis="y", useOffset=False)
+        axis.locator_params(axis="y", nbins=5)
+
+
+def _annotate(figure: Figure, data: _Track, colours: list[Any], title: str) -> None:
+    """Title, what each colour is, and what each status is that occurs."""
+    frames, templates = data.status.shape
+    count = f"{frames:,} frame{'s' * (frames > 1)}, {templates} template{'s' * (templates > 1)}"
+    figure.align_ylabels()
+    figure.suptitle(f"{title}   ({count})" if title else count, fontsize=13)
+    if templates > len(_COLOURS):
+        norm = Normalize(0, templates - 1)
+        figure.colorbar(ScalarMappable(norm, "viridis"), ax=figure.axes, label="template", aspect=60, pad=0.01)
+    elif templates > 1:
+        handles = [Patch(color=colour, label=f"template {r}") for r, colour in enumerate(colours)]
+        figure.axes[0].legend(handles=handles, ncols=templates, loc="lower left", bbox_to_anchor=(0, 1), frameon=False)
+    shades, seen = _status_colours(data.words), np.unique(data.status)
+    handles = [Patch(color=shades[data.words[k]], label=data.words[k].replace("_", " ").lower()) for k in seen]
+    figure.legend(handles=handles, ncols=len(handles), loc="outside lower center", frameon=False)
+
+
+def _save(figure: Figure, path: Path, dpi: int) -> Path:
+    """Under another name first: what bears the final name is whole."""
+    part = path.with_name(f"{path.name}.part")
+    part.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(part, dpi=dpi, format=path.suffix.lstrip(".") or "png")
+    os.replace(part, path)
+    return path

@@ -1,0 +1,111 @@
+"""Lithographic scenes: sharp rectangles seen through a Gaussian point-spread function, exactly.
+
+A rectangle blurred by a Gaussian is a product of two differences of error functions in the rectangle's own axes, at
+any angle. Levels add up; rectangles that share an edge join without a seam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from math import pi, sqrt
+
+import torch
+from torch import Tensor
+
+from torch_ecc.pose import compose, inverse, rotation, transform
+from torch_ecc.sim.footprint import footprint
+from torch_ecc.sim.layout import Rectangle, wafer
+
+REACH = 5.0  # sigmas beyond an edge after which a rectangle is not drawn: 3e-7 of its level
+CHUNK = 1 << 20  # rectangles times points worked on at once by value() and gradient()
+
+
+@dataclass(frozen=True, eq=False)
+class Pads:
+    """``base`` plus N rectangles blurred by a Gaussian of ``sigma`` px.
+
+    ``poses`` (N, 3) rectangle -> scene, ``half_sizes`` (N, 2) px, ``levels`` (N,) grey levels; all float64.
+    """
+
+    poses: Tensor
+    half_sizes: Tensor
+    levels: Tensor
+    sigma: float = 1.0
+    base: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.sigma > 0:
+            raise ValueError(f"Pads: sigma must be > 0, got {self.sigma}")
+        count = len(self.poses)
+        if self.poses.shape != (count, 3) or self.half_sizes.shape != (count, 2) or self.levels.shape != (count,):
+            shapes = [tuple(t.shape) for t in (self.poses, self.half_sizes, self.levels)]
+            raise ValueError(f"Pads: poses, half_sizes, levels must be (N, 3), (N, 2), (N,), got {shapes}")
+
+    @classmethod
+    def of(cls, rectangles: Iterable[Rectangle], *, sigma: float = 1.0, base: float = 0.0) -> Pads:
+        """A scene of ``rectangles`` on a background of ``base`` grey levels."""
+        rows = torch.tensor([tuple(r) for r in rectangles], dtype=torch.float64).reshape(-1, 6)
+        return cls(rows[:, (0, 1, 5)], rows[:, 2:4] / 2, rows[:, 4], sigma, base)
+
+    @classmethod
+    def wafer(cls, *, pitch: float = 90.0, contrast: float = 70.0, sigma: float = 1.0, seed: int = 0) -> Pads:
+        """Bright pads on a grid, joined by a few lines: large flat areas and few edges, hard for a tracker.
+
+        ``pitch`` px between pads, ``contrast`` grey levels of the pads over the substrate. Covers 1500 x 1500 px.
+        ValueError if pitch or sigma is not positive.
+        """
+        return cls.of(wafer(pitch, contrast, seed), sigma=sigma, base=100.0)
+
+    def value(self, points: Tensor) -> Tensor:
+        """Grey levels at scene points: (..., 2) float64 px -> (...) float64."""
+
+        def total(local: Tensor) -> Tensor:
+            x, y = (_band(local[..., i], self.half_sizes.to(local)[:, None, i], self.sigma) for i in (0, 1))
+            return self.levels.to(local) @ (x * y)
+
+        return self.base + self._over(points, total)
+
+    def gradient(self, points: Tensor) -> Tensor:
+        """Exact gradient at scene points, grey levels per px: (..., 2) -> (..., 2)."""
+
+        def total(local: Tensor) -> Tensor:
+            half = self.half_sizes.to(local)[:, None]
+            x, y = (_band(local[..., i], half[..., i], self.sigma) for i in (0, 1))
+            dx, dy = (_slope(local[..., i], half[..., i], self.sigma) for i in (0, 1))
+            weighted = self.levels.to(local)[:, None, None] * torch.stack((dx * y, x * dy), -1)
+            return (weighted @ rotation(self.poses.to(local)[:, 2]).mT).sum(0)
+
+        return self._over(points, total)
+
+    def _over(self, points: Tensor, total: Callable[[Tensor], Tensor]) -> Tensor:
+        """``total`` of the points in every rectangle's axes, (N, P, 2) -> (P, ...), a bounded number at a time."""
+        flat = points.reshape(-1, 2)
+        to_local = inverse(self.poses.to(points))
+        parts = [total(transform(to_local, some)) for some in flat.split(max(1, CHUNK // max(1, len(to_local))))]
+        result = torch.cat(parts) if parts else flat.new_empty(0)
+        return result.reshape(*points.shape[:-1], *result.shape[1:])
+
+    def render(self, poses: Tensor, size: tuple[int, int]) -> Tensor:
+        """Frames of ``size`` = (h, w) at poses (B, 3): (B, 1, h, w) float32 on the poses' device."""
+        frames = torch.full((len(poses), size[0] * size[1]), self.base, dtype=torch.float32, device=poses.device)
+        rectangles, half = self.poses.to(poses.device), self.half_sizes.to(poses.device)
+        levels, single = self.levels.to(poses.device).float(), half.float()
+        for frame, pose in zip(frames, poses.double(), strict=True):
+            placed = compose(pose.expand_as(rectangles), rectangles)
+            for box, pixel, x, y in footprint(placed, half + REACH * self.sigma, size):
+                width, height, level = (values.index_select(0, box) for values in (*single.unbind(1), levels))
+                frame.index_add_(0, pixel, _band(x, width, self.sigma) * _band(y, height, self.sigma) * level)
+        return frames.reshape(-1, 1, *size)
+
+
+def _band(x: Tensor, half: Tensor, sigma: float) -> Tensor:
+    """The interval |x| <= half blurred by a Gaussian: 1 inside, 0 outside."""
+    scale = 1 / (sqrt(2) * sigma)
+    return 0.5 * (torch.erf((x + half) * scale) - torch.erf((x - half) * scale))
+
+
+def _slope(x: Tensor, half: Tensor, sigma: float) -> Tensor:
+    """Derivative of ``_band`` by x, per px."""
+    left, right = (x + half) / sigma, (x - half) / sigma
+    return ((-0.5 * left**2).exp() - (-0.5 * right**2).exp()) / (sqrt(2 * pi) * sigma)
