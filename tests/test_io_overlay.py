@@ -127,14 +127,14 @@ def test_the_colour_is_the_status(tmp_path, status, colour):
 
 
 def test_labels_do_not_cover_each_other_or_leave_the_frame(tmp_path):
-    """Two that touched would be one dark patch; each is about as large as the first."""
+    """Two that touched would be one dark patch; each is about as large as the first (numbers differ in width)."""
     poses = [(50.0 + 200 * i, 30.0 + 140 * j, 0.1) for i in range(3) for j in range(4)]
     picture = drawn(tmp_path, GREY, found_at(*poses), shapes=[(41, 41)] * 12)
     number, _, stats, _ = cv2.connectedComponentsWithStats((picture.max(-1) < 40).astype(np.uint8))
     sizes = [(stat[cv2.CC_STAT_WIDTH], stat[cv2.CC_STAT_HEIGHT]) for stat in stats[1:number]]
     labels = np.array([size for size in sizes if size[0] > 100])
     assert len(labels) == 12
-    np.testing.assert_allclose(labels, labels[:1].repeat(12, 0), atol=10)
+    np.testing.assert_allclose(labels, labels[:1].repeat(12, 0), atol=15)
 
 
 def test_a_crowd_gets_numbers_only(tmp_path):

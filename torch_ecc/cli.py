@@ -61,6 +61,7 @@ def demo(out: str, frames: int) -> None:
 @click.option("--levels", type=int, help="Pyramid levels, for large motion [default: 1].")
 @click.option("--prediction", help="Start of each frame: hold or velocity [default: velocity].")
 @click.option("--min-score", type=float, help="Below this correlation a template is lost [default: 0.5].")
+@click.option("--search/--no-search", default=None, help="Look around for a lost template [default: yes].")
 @click.option("--device", help="cpu, cuda, ... [default: cpu].")
 @click.option("--overlay/--no-overlay", default=None, help="Write overlay.mp4 [default: yes].")
 def track(config: str | None, size: str | None, polygons: tuple[str, ...], **options: Any) -> None:

@@ -51,6 +51,7 @@ class TrackJob:
     levels: int = 1
     prediction: str = "velocity"
     min_score: float = 0.5
+    search: bool = True
     device: str | None = None
     um_per_px: float | Point | None = None
     axis_angle_deg: float = 0.0
@@ -101,7 +102,9 @@ class Session:
         frames = iter(self.source)
         first = next(frames) if job.reference is None else next(iter(open_frames(job.reference)))
         self.frames = frames if job.reference else chain((first,), frames)
-        names = "criterion illumination interpolation max_iterations tolerance levels prediction device min_score"
+        names = (
+            "criterion illumination interpolation max_iterations tolerance levels prediction device min_score search"
+        )
         options = {name: getattr(job, name) for name in names.split()}
         centers, size, mask = self.templates
         self.tracker = Tracker(first, centers, size, mask=mask, **options)

@@ -43,8 +43,8 @@ class Tracker(nn.Module):
     "bilinear", "bspline3", "bspline5"; ``tolerance``: px at the template's corner; ``levels``: pyramid levels;
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
-    the frame's); ``min_score``: below it a template is lost. A template that is not found is searched for with a
-    pyramid around its last good pose, in this and the following frames. Raises ValueError for what does not fit.
+    the frame's); ``min_score``: below it a template is lost; ``search``: look for a lost template around its last good
+    pose, with a pyramid, in this and the following frames. Raises ValueError for what does not fit.
     """
 
     pose: Tensor
@@ -69,12 +69,13 @@ class Tracker(nn.Module):
         mask: Tensor | None = None,
         device: torch.device | str | None = None,
         min_score: float = 0.5,
+        search: bool = True,
     ) -> None:
         super().__init__()
         if prediction not in PREDICTIONS:
             raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
         self.settings = Settings(interpolation, max_iterations, tolerance, min_score)
-        self.prediction = prediction
+        self.prediction, self.search = prediction, search
         chosen = make_criterion(criterion, illumination)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape = tuple(gray.shape)
@@ -107,7 +108,7 @@ class Tracker(nn.Module):
         images = [gray]
         estimate = self._solve(images, compose(self.pose, self.velocity), self.levels)
         lost = (~Status.good(estimate.status)).nonzero()[:, 0]
-        if len(lost):
+        if len(lost) and self.search:
             estimate = self._search(images, estimate, lost)
         return self._advance(estimate)
 

@@ -1,0 +1,117 @@
+"""Real sequences with known motion: python benchmarks/real.py DATA_FOLDER (or TORCH_ECC_DATA).
+
+Prints the largest errors on mechanism_video, pixel_shift, pyvale_rigid and rotation_full at default settings, and how
+far a jump may go with and without pyramid and search.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from torch_ecc import Status, Tracker
+from torch_ecc.io import open_frames
+from torch_ecc.session import TrackJob, choose_templates
+
+console = Console(width=120)
+
+
+def facts(folder: Path) -> dict:
+    return json.loads((folder / "truth.json").read_text())
+
+
+def frames(folder: Path) -> list[torch.Tensor]:
+    return list(open_frames(str(folder / "f*.png")))
+
+
+def reference(folder: Path) -> torch.Tensor:
+    return next(iter(open_frames(str(folder / "ref.png"))))
+
+
+def middle(hint: list[int]) -> tuple[float, float]:
+    x, y, w, h = hint
+    return (x + (w - 1) / 2, y + (h - 1) / 2)
+
+
+def mechanism(folder: Path) -> list[tuple[str, ...]]:
+    truth = facts(folder)
+    bodies = truth["bodies"].values()
+    outlines = tuple(tuple(map(tuple, body["mask_polygon"])) for body in bodies)
+    centers, size, mask = choose_templates(
+        TrackJob("", centers=tuple(tuple(body["centre_px"]) for body in bodies), polygons=outlines)
+    )
+    video = frames(folder)
+    track = Tracker(video[0], centers, size, mask=mask).track_sequence(video[1:])
+    rows = []
+    for b, name in enumerate(truth["bodies"]):
+        moves = [[f["bodies"][name][k] for k in ("tx", "ty", "theta_deg")] for f in truth["frames"][-55:]]
+        error = track.displacement[:, b] - torch.tensor(moves) * torch.tensor([1, 1, -math.pi / 180])
+        rows.append(row(f"mechanism_video, body {name}", error, track.status[:, b]))
+    return rows
+
+
+def row(name: str, error: torch.Tensor, status: torch.Tensor) -> tuple[str, ...]:
+    largest = error.abs().amax(0)
+    converged = int((status == Status.CONVERGED).sum())
+    px, deg = f"{float(largest[:2].max()):.5f}", f"{math.degrees(float(largest[2])):.5f}"
+    return name, px, deg, f"{converged} of {len(status)}"
+
+
+def shifts(folder: Path) -> tuple[str, ...]:
+    truth = facts(folder)
+    track = Tracker(reference(folder), [middle(truth["template_hint"])], 121).track_sequence(frames(folder))
+    expected = torch.tensor([[f["tx"], f["ty"], 0.0] for f in truth["frames"]])
+    return row(folder.name, track.displacement[:, 0] - expected, track.status[:, 0])
+
+
+def rotation(folder: Path, center: tuple[float, float], size: int) -> tuple[str, ...]:
+    truth = facts(folder)
+    track = Tracker(reference(folder), [center], size).track_sequence(frames(folder))
+    c, p = torch.tensor(truth["centre_px"]), torch.tensor(center)
+    expected = []
+    for f in truth["frames"]:
+        a = math.radians(f["theta_deg"])
+        turn = torch.tensor([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
+        expected.append([*(c + turn @ (p - c)).tolist(), -a])
+    return row(f"{folder.name}, {size} px at {center}", track.pose[:, 0] - torch.tensor(expected), track.status[:, 0])
+
+
+def basin(folder: Path, levels: int, search: bool) -> tuple[str, str]:
+    """Largest whole-px jump in x and y at once from the first frame that is found, all smaller ones too."""
+    truth, still = facts(folder), reference(folder)
+    reached = 0
+    for f, frame in zip(truth["frames"], frames(folder), strict=True):
+        estimate = Tracker(still, [middle(truth["template_hint"])], 121, levels=levels, search=search)(frame)
+        good = bool(Status.good(estimate.status)) and abs(float(estimate.displacement[0, 0]) - f["tx"]) < 0.002
+        if not good:
+            break
+        reached = int(f["tx"])
+    return f"levels={levels}" + (", search" if search else ""), f"{reached} of {len(truth['frames'])} px"
+
+
+def main() -> None:
+    data = Path(sys.argv[1] if len(sys.argv) > 1 else os.environ["TORCH_ECC_DATA"])
+    table = Table("sequence", "largest px", "largest deg", "converged", title="Real sequences, default settings")
+    for cells in mechanism(data / "mechanism_video"):
+        table.add_row(*cells)
+    for name in ("pixel_shift", "pyvale_rigid"):
+        table.add_row(*shifts(data / name))
+    table.add_row(*rotation(data / "rotation_full", (70.0, 52.0), 49))
+    table.add_row(*rotation(data / "rotation_full", (126.0, 126.0), 201))
+    console.print(table)
+    jumps = Table("settings", "largest jump in x and y", title="pixel_shift, each frame from the first one's pose")
+    for levels, search in ((1, False), (2, False), (3, False), (1, True)):
+        jumps.add_row(*basin(data / "pixel_shift", levels, search))
+    console.print(jumps)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main()

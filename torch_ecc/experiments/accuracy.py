@@ -1,0 +1,155 @@
+"""Accuracy on analytic scenes: scatter against the Cramer-Rao bound, honesty of the covariance, uneven light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.align import align
+from torch_ecc.estimate import Estimate, Status
+from torch_ecc.experiments.bound import QUANTISATION, cramer_rao
+from torch_ecc.pose import compose, inverse
+from torch_ecc.reference import MARGIN, prepare
+from torch_ecc.sim.camera import Camera
+from torch_ecc.sim.light import Light
+from torch_ecc.sim.motion import harmonic, placed
+from torch_ecc.sim.scene import Scene
+from torch_ecc.tracker import Tracker
+
+SIZE = 121  # px, the paper's template
+BATCH = 50  # pairs that are aligned at once
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Random pairs of template and frame, both drawn anew each time.
+
+    ``noise`` in grey levels, ``count`` pairs, displacements up to 10 px in x and y and, with ``turn``, any angle.
+    """
+
+    noise: float = 0.0
+    count: int = 250
+    turn: bool = True
+    illumination: str = "linear"
+    interpolation: str = "bspline3"
+    seed: int = 0
+
+
+class Scatter(NamedTuple):
+    """Pose errors (draws, 3) px, px, rad, their normalised squares over 3 (draws,), the bound (3,), iterations and
+    status (draws,)."""
+
+    error: Tensor
+    nees: Tensor
+    bound: Tensor
+    iterations: Tensor
+    status: Tensor
+
+    @property
+    def ratio(self) -> Tensor:
+        """Root mean square error over the Cramer-Rao bound, (3,)."""
+        return self.error.square().mean(0).sqrt() / self.bound
+
+
+def scatter(scene: Scene, draws: Draws) -> Scatter:
+    """Align templates cut at random sub-pixel places of ``scene`` with frames at random poses, 8 bit."""
+    half = SIZE // 2 + MARGIN
+    frame, middle = 2 * half + 80, torch.tensor([[half + 40.0, half + 40.0, 0.0]], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(draws.seed)
+    phase, shift = torch.rand(2, draws.count, 3, generator=generator, dtype=torch.float64) - 0.5
+    first = middle + phase * torch.tensor([1.0, 1.0, 0.0])
+    second = first + shift * torch.tensor([20.0, 20.0, math.tau if draws.turn else 0.0])
+    truth = compose(second, compose(inverse(first), middle.expand_as(first)))
+    camera = Camera(size=(frame, frame), noise_sigma=draws.noise)
+    cut = slice(40, 40 + 2 * half + 1)
+    mask = torch.zeros(2 * half + 1, 2 * half + 1, dtype=torch.bool)
+    mask[MARGIN:-MARGIN, MARGIN:-MARGIN] = True  # what lies around the template gives its border true gradients
+    near = truth + torch.tensor([0.3, -0.3, math.radians(0.17)])
+    found = []
+    for k in range(0, draws.count, BATCH):
+        part = slice(k, k + BATCH)
+        template = camera.capture(scene, first[part], seed=2 * draws.seed, first=k)[:, :, cut, cut]
+        image = camera.capture(scene, second[part], seed=2 * draws.seed + 1, first=k)
+        reference = prepare(template, illumination=draws.illumination, mask=mask)
+        found.append(align(reference, image, near[part], interpolation=draws.interpolation))
+    return _summary(scene, draws, truth, Estimate(*(torch.cat(v) for v in zip(*found, strict=True))))
+
+
+def _summary(scene: Scene, draws: Draws, truth: Tensor, found: Estimate) -> Scatter:
+    error = found.pose - truth
+    nees = (error[:, None] @ torch.linalg.solve(found.covariance, error[:, :, None])).flatten() / 3
+    bound = cramer_rao(scene, (SIZE, SIZE), 2 * (draws.noise**2 + QUANTISATION))
+    return Scatter(error, nees, bound, found.iterations, found.status)
+
+
+@dataclass(frozen=True)
+class Harmonic:
+    """One cycle of eq. (11): ``amplitude_px`` in x and y and ``amplitude_deg``, ``frames`` of them."""
+
+    amplitude_px: float = 20.0
+    amplitude_deg: float = 5.0
+    frames: int = 40
+
+    def path(self, camera: Camera) -> Tensor:
+        """Poses (frames + 1, 3) of the scene about the middle of the frame; the first one is the template's."""
+        h, w = camera.size
+        turn = math.radians(self.amplitude_deg)
+        cycle = harmonic((self.amplitude_px, self.amplitude_px, turn), self.frames)
+        return placed(torch.cat((cycle[-1:], cycle)), (w / 2, h / 2))
+
+
+class Run(NamedTuple):
+    """Pose errors (F, 3) px, px, rad of a tracked sequence, and the status (F,)."""
+
+    error: Tensor
+    status: Tensor
+
+    @property
+    def largest(self) -> tuple[float, float]:
+        """Largest error in x or y, px, and in theta, deg."""
+        return float(self.error[:, :2].abs().max()), math.degrees(float(self.error[:, 2].abs().max()))
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Root mean square error of the worse of x and y, px, and of theta, deg."""
+        rms = self.error.square().mean(0).sqrt()
+        return float(rms[:2].max()), math.degrees(float(rms[2]))
+
+    @property
+    def lost(self) -> int:
+        """Frames without a new pose."""
+        return int((~Status.good(self.status)).sum())
+
+
+def track_path(scene: Scene, camera: Camera, path: Tensor, *, seed: int = 0, **options: str) -> Run:
+    """Errors of a tracker with ``options`` whose template is cut at the scene's origin in the first frame of ``path``.
+
+    ``path`` (F + 1, 3); frame by frame, so that memory does not grow with F.
+    """
+    first = camera.capture(scene, path[:1], seed=seed)[0, 0]
+    start = torch.cat((path[:1, :2], path.new_zeros(1, 1)), 1)
+    truth = compose(path, compose(inverse(path[:1]), start).expand_as(path))[1:]
+    tracker = Tracker(first, start[:, :2], SIZE, **options)  # type: ignore[arg-type]
+    frames = (camera.capture(scene, path[k : k + 1], seed=seed, first=k)[0, 0] for k in range(1, len(path)))
+    track = tracker.track_sequence(frames)
+    return Run(track.pose[:, 0] - truth, track.status[:, 0])
+
+
+LIGHT_METHODS = {
+    "ssd": {"criterion": "ssd"},
+    "ecc_paper": {"criterion": "ecc_paper"},
+    "ecc, gain": {"illumination": "gain"},
+    "ecc, linear": {"illumination": "linear"},
+    "ecc, quadratic": {"illumination": "quadratic"},
+}
+
+
+def under_light(scene: Scene, light: Light | None, motion: Harmonic) -> dict[str, Run]:
+    """Each method's errors under ``light`` (none: even light), noise-free and unquantised."""
+    camera = Camera(light=light, bits=None)
+    path = motion.path(camera)
+    return {name: track_path(scene, camera, path, **options) for name, options in LIGHT_METHODS.items()}
