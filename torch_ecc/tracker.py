@@ -23,7 +23,8 @@ PREDICTIONS = ("hold", "velocity")
 SEARCH_LEVELS = 3  # pyramid levels of the second attempt for a template that was not found where it was expected
 SMALLEST_COARSE = 12  # px: a template is not halved below this side
 COARSE_TOLERANCE = 0.1  # px of a coarse level
-FAMILIAR = 0.8  # share of its last good score that a template must have to count as found by a search
+FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
+MEMORY = 0.05  # weight of the newest frame in the usual score
 
 
 class SequenceError(ValueError):
@@ -168,7 +169,7 @@ class Tracker(nn.Module):
             # The last step in the template's own axes: exact for a constant turn about any point of the stage.
             self.velocity = torch.where(good & self.tracked[:, None], compose(inverse(self.pose), pose), 0.0)
         self.pose, self.tracked = pose, good[:, 0]
-        self.score = torch.where(self.tracked, estimate.score, self.score)
+        self.score = torch.where(self.tracked, torch.lerp(self.score, estimate.score, MEMORY), self.score)
         return estimate._replace(pose=pose, displacement=pose - self.start)
 
 

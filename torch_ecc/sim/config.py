@@ -1,4 +1,4 @@
-"""A sequence from a configuration, as ``torch-ecc simulate CONFIG.toml`` reads it; ``configs/simulate.toml`` has it all.
+"""A sequence from a configuration, as ``torch-ecc simulate CONFIG.toml`` reads it; see ``configs/simulate.toml``.
 
 Everything is checked before anything is rendered. The names of settings are those of the constructors they fill.
 """
@@ -64,6 +64,17 @@ class Template:
             raise ValueError(f"Template: size must be (h, w) of at least 1 px, got {self.size}")
 
 
+@dataclass(frozen=True)
+class Placement:
+    """Where the motion happens: about ``center`` (x, y) px, the middle of the frame unless given.
+
+    ``lead_in`` frames go from rest at the centre to the first pose; 0 starts in the first pose.
+    """
+
+    center: tuple[float, float] | None = None
+    lead_in: int = 20
+
+
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """A checked configuration: the sequence, the template to track in it and the configuration itself."""
@@ -72,18 +83,6 @@ class Simulation:
     template: Template
     truth: Tensor  # (F, 1, 3) px, px, rad: the poses of the template
     metadata: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class _Config:
-    """The tables of a configuration file."""
-
-    scene: dict[str, Any]
-    motion: dict[str, Any]
-    light: list[dict[str, Any]]
-    camera: dict[str, Any]
-    template: dict[str, Any]
-    seed: int
 
 
 def from_config(values: Mapping[str, Any], *, folder: Path | str = ".") -> Simulation:
@@ -98,13 +97,77 @@ def from_config(values: Mapping[str, Any], *, folder: Path | str = ".") -> Simul
             raise ValueError(f"simulate: unknown key {key!r}, known are {', '.join(known)}")
     folder = Path(folder)
     camera = _camera(values.get("camera", {}), _light(values.get("light", []), folder), folder)
-    poses = _motion(values.get("motion", {}), camera.size, folder)
-    template = fill(Template, values.get("template", {}), "[template]", folder=folder)
-    scene = choose(SCENES, {"kind": "micrograph", **values.get("scene", {})}, "[scene]", folder=folder)
+    poses = _motion(_table(values, "motion", "harmonic"), camera.size, folder)
+    template = _template(values.get("template", {}), folder)
+    scene = choose(SCENES, _table(values, "scene", "micrograph"), "[scene]", folder=folder)
     sequence = Sequence(scene, poses, camera, _seed(values.get("seed", 0)))
-    center = poses[:1, :2].round() if template.center is None else poses.new_tensor([template.center])
-    truth = sequence.truth(center)
+    center = poses[0, :2].round() if template.center is None else poses.new_tensor(template.center)
+    truth = sequence.truth(center[None])
     check_inside(truth, template.size, camera.size)
-    marked = Template(template.size, (float(center[0, 0]), float(center[0, 1])))
-    metadata = {"config": dict(values), "template": {"size": list(marked.size), "center": list(center[0].tolist())}}
-    return Simulation(sequence, marked, truth, metadata)
+    x, y = center.tolist()
+    metadata = {"config": dict(values), "template": {"size": list(template.size), "center": [x, y]}}
+    return Simulation(sequence, Template(template.size, (x, y)), truth, metadata)
+
+
+def _table(values: Mapping[str, Any], key: str, kind: str) -> Any:
+    """A table of the configuration, of the default ``kind`` if it names none."""
+    table = values.get(key, {})
+    return {"kind": kind, **table} if isinstance(table, Mapping) else table
+
+
+def _template(values: Any, folder: Path) -> Template:
+    """The template; a single number as ``size`` is the side of a square."""
+    if isinstance(values, Mapping) and isinstance(values.get("size"), int):
+        values = {**values, "size": [values["size"]] * 2}
+    return fill(Template, values, "[template]", folder=folder)
+
+
+def _seed(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"simulate: seed must be an integer >= 0, got {value!r}")
+    return value
+
+
+def _light(values: Any, folder: Path) -> Light | None:
+    """One [light] table, or several [[light]] that multiply."""
+    tables = [values] if isinstance(values, Mapping) else values
+    if not isinstance(tables, list):
+        raise ValueError(f"[light] must be a table or an array of tables, got {values!r}")
+    lights = tuple(choose(LIGHTS, table, "[light]", folder=folder) for table in tables)
+    return (lights[0] if len(lights) == 1 else Lights(lights)) if lights else None
+
+
+def _camera(values: Any, light: Light | None, folder: Path) -> Camera:
+    """The camera; ``noise_variance`` may stand for ``noise_sigma``, and bits = "float" for None, which TOML has not."""
+    settings = dict(values) if isinstance(values, Mapping) else values
+    if isinstance(settings, dict) and "noise_variance" in settings:
+        if "noise_sigma" in settings:
+            raise ValueError("[camera]: give noise_sigma or noise_variance, got both")
+        variance = settings.pop("noise_variance")
+        if not isinstance(variance, int | float) or isinstance(variance, bool):
+            raise ValueError(f"[camera]: noise_variance must be a number, got {variance!r}")
+        settings["noise_sigma"] = noise_sigma(variance)
+    if isinstance(settings, dict) and settings.get("bits") == "float":
+        settings["bits"] = None
+    return fill(Camera, settings, "[camera]", folder=folder, light=light)
+
+
+def _motion(values: Any, size: tuple[int, int], folder: Path) -> Tensor:
+    """The poses in the frame; a key that ends in ``_deg`` gives its angle (the last number of a row) in degrees."""
+    if not isinstance(values, Mapping):
+        raise ValueError(f"[motion] must be a table of settings, got {values!r}")
+    own = {key: value for key, value in values.items() if key in ("center", "lead_in")}
+    settings = {k.removesuffix("_deg"): _radians(k, v) for k, v in values.items() if k not in own}
+    placement = fill(Placement, own, "[motion]", folder=folder)
+    poses = motion.from_rest(choose(MOTIONS, settings, "[motion]", folder=folder), placement.lead_in)
+    return motion.placed(poses, placement.center or (size[1] // 2, size[0] // 2))
+
+
+def _radians(key: str, value: Any) -> Any:
+    if not key.endswith("_deg"):
+        return value
+    row = list(value) if isinstance(value, list | tuple) else [value]
+    if not row or not isinstance(row[-1], int | float):
+        raise ValueError(f"[motion]: {key} must be numbers, got {value!r}")
+    turned = [*row[:-1], radians(row[-1])]
+    return turned if isinstance(value, list | tuple) else turned[0]
