@@ -110,14 +110,15 @@ class Run(NamedTuple):
 
     @property
     def largest(self) -> tuple[float, float]:
-        """Largest error in x or y, px, and in theta, deg."""
-        return float(self.error[:, :2].abs().max()), math.degrees(float(self.error[:, 2].abs().max()))
+        """Largest error in x or y, px, and in theta, deg, of the frames that were not lost."""
+        x, y, theta = self.error[Status.good(self.status)].abs().amax(0).tolist()
+        return max(x, y), math.degrees(theta)
 
     @property
     def rms(self) -> tuple[float, float]:
-        """Root mean square error of the worse of x and y, px, and of theta, deg."""
-        rms = self.error.square().mean(0).sqrt()
-        return float(rms[:2].max()), math.degrees(float(rms[2]))
+        """Root mean square error of the worse of x and y, px, and of theta, deg, of the frames that were not lost."""
+        x, y, theta = self.error[Status.good(self.status)].square().mean(0).sqrt().tolist()
+        return max(x, y), math.degrees(theta)
 
     @property
     def lost(self) -> int:
