@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -126,15 +127,17 @@ class Run(NamedTuple):
         return int((~Status.good(self.status)).sum())
 
 
-def track_path(scene: Scene, camera: Camera, path: Tensor, *, seed: int = 0, **options: str) -> Run:
-    """Errors of a tracker with ``options`` whose template is cut at the scene's origin in the first frame of ``path``.
+def track_path(
+    scene: Scene, camera: Camera, path: Tensor, *, options: Mapping[str, Any] | None = None, seed: int = 0
+) -> Run:
+    """Errors of a Tracker with ``options`` whose template is cut at the scene's origin in the first frame of ``path``.
 
     ``path`` (F + 1, 3); frame by frame, so that memory does not grow with F.
     """
     first = camera.capture(scene, path[:1], seed=seed)[0, 0]
     start = torch.cat((path[:1, :2], path.new_zeros(1, 1)), 1)
     truth = compose(path, compose(inverse(path[:1]), start).expand_as(path))[1:]
-    tracker = Tracker(first, start[:, :2], SIZE, **options)  # type: ignore[arg-type]
+    tracker = Tracker(first, start[:, :2], SIZE, **(options or {}))
     frames = (camera.capture(scene, path[k : k + 1], seed=seed, first=k)[0, 0] for k in range(1, len(path)))
     track = tracker.track_sequence(frames)
     return Run(track.pose[:, 0] - truth, track.status[:, 0])
@@ -153,4 +156,4 @@ def under_light(scene: Scene, light: Light | None, motion: Harmonic) -> dict[str
     """Each method's errors under ``light`` (none: even light), noise-free and unquantised."""
     camera = Camera(light=light, bits=None)
     path = motion.path(camera)
-    return {name: track_path(scene, camera, path, **options) for name, options in LIGHT_METHODS.items()}
+    return {name: track_path(scene, camera, path, options=options) for name, options in LIGHT_METHODS.items()}

@@ -32,4 +32,5 @@ def cramer_rao(scene: AnalyticScene, size: tuple[int, int], variance: float) -> 
     J = torch.stack((gx, gy, gx * points[:, 1] - gy * points[:, 0]), -1)
     span, _ = torch.linalg.qr(torch.stack((torch.ones_like(t), t), -1))
     J = J - span @ (span.mT @ J)
-    return (variance * torch.linalg.inv(J.mT @ J)).diagonal().sqrt()
+    covariance: Tensor = variance * torch.linalg.inv(J.mT @ J)
+    return covariance.diagonal().sqrt()
