@@ -111,7 +111,8 @@ def test_colour_tiff_pages_keep_their_depth(tmp_path, dtype, channels):
     """Pillow would read 16-bit colours as 8-bit ones, and no float colours at all."""
     frames = stack(dtype, channels=channels)
     bgr = [cv2.cvtColor(f, cv2.COLOR_RGB2BGR if channels == 3 else cv2.COLOR_RGBA2BGRA) for f in frames]
-    assert cv2.imwritemulti(str(tmp_path / "s.tiff"), bgr)
+    raw = [cv2.IMWRITE_TIFF_COMPRESSION, 1]  # older OpenCV would round float colours to LogLuv
+    assert cv2.imwritemulti(str(tmp_path / "s.tiff"), bgr, raw)
     assert_same(open_frames(tmp_path / "s.tiff"), frames)
 
 

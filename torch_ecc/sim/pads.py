@@ -6,7 +6,7 @@ any angle. Levels add up; rectangles that share an edge join without a seam.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import pi, sqrt
 
@@ -18,7 +18,8 @@ from torch_ecc.sim.footprint import footprint
 from torch_ecc.sim.layout import Rectangle, wafer
 
 REACH = 5.0  # sigmas beyond an edge after which a rectangle is not drawn: 3e-7 of its level
-CHUNK = 1 << 20  # rectangles times points worked on at once by value() and gradient()
+EXACT_REACH = 9.0  # the same for value() and gradient(): 1e-19 of its level
+CHUNK = 512  # points worked on at once by value() and gradient(), with the rectangles near them
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,32 +60,37 @@ class Pads:
 
     def value(self, points: Tensor) -> Tensor:
         """Grey levels at scene points: (..., 2) float64 px -> (...) float64."""
-
-        def total(local: Tensor) -> Tensor:
-            x, y = (_band(local[..., i], self.half_sizes.to(local)[:, None, i], self.sigma) for i in (0, 1))
-            return self.levels.to(local) @ (x * y)
-
-        return self.base + self._over(points, total)
+        flat = points.reshape(-1, 2)
+        parts = [self._near(some)._value(some) for some in flat.split(CHUNK)]
+        return self.base + torch.cat([flat.new_empty(0), *parts]).reshape(points.shape[:-1])
 
     def gradient(self, points: Tensor) -> Tensor:
         """Exact gradient at scene points, grey levels per px: (..., 2) -> (..., 2)."""
-
-        def total(local: Tensor) -> Tensor:
-            half = self.half_sizes.to(local)[:, None]
-            x, y = (_band(local[..., i], half[..., i], self.sigma) for i in (0, 1))
-            dx, dy = (_slope(local[..., i], half[..., i], self.sigma) for i in (0, 1))
-            weighted = self.levels.to(local)[:, None, None] * torch.stack((dx * y, x * dy), -1)
-            return (weighted @ rotation(self.poses.to(local)[:, 2]).mT).sum(0)
-
-        return self._over(points, total)
-
-    def _over(self, points: Tensor, total: Callable[[Tensor], Tensor]) -> Tensor:
-        """``total`` of the points in every rectangle's axes, (N, P, 2) -> (P, ...), a bounded number at a time."""
         flat = points.reshape(-1, 2)
-        to_local = inverse(self.poses.to(points))
-        parts = [total(transform(to_local, some)) for some in flat.split(max(1, CHUNK // max(1, len(to_local))))]
-        result = torch.cat(parts) if parts else flat.new_empty(0)
-        return result.reshape(*points.shape[:-1], *result.shape[1:])
+        parts = [self._near(some)._gradient(some) for some in flat.split(CHUNK)]
+        return torch.cat([flat.new_empty(0, 2), *parts]).reshape(points.shape)
+
+    def _near(self, points: Tensor) -> Pads:
+        """The rectangles that double precision can see at any of the points (P, 2)."""
+        centers, half = self.poses[:, :2].to(points), self.half_sizes.to(points)
+        reach = half.norm(dim=1, keepdim=True) + EXACT_REACH * self.sigma
+        low, high = points.detach().amin(0) - reach, points.detach().amax(0) + reach
+        near = ((centers >= low) & (centers <= high)).all(1)
+        return Pads(self.poses.to(points)[near], half[near], self.levels.to(points)[near], self.sigma)
+
+    def _value(self, points: Tensor) -> Tensor:
+        """The sum of all rectangles: (P, 2) -> (P,)."""
+        local = transform(inverse(self.poses), points)
+        x, y = (_band(local[..., i], self.half_sizes[:, None, i], self.sigma) for i in (0, 1))
+        return self.levels @ (x * y)
+
+    def _gradient(self, points: Tensor) -> Tensor:
+        """Its gradient: slopes along each rectangle's own axes, turned into the scene: (P, 2) -> (P, 2)."""
+        local, half = transform(inverse(self.poses), points), self.half_sizes[:, None]
+        x, y = (_band(local[..., i], half[..., i], self.sigma) for i in (0, 1))
+        dx, dy = (_slope(local[..., i], half[..., i], self.sigma) for i in (0, 1))
+        turn = self.levels[:, None, None] * rotation(self.poses[:, 2])
+        return (turn[..., 0].mT @ (dx * y) + turn[..., 1].mT @ (x * dy)).mT
 
     def render(self, poses: Tensor, size: tuple[int, int]) -> Tensor:
         """Frames of ``size`` = (h, w) at poses (B, 3): (B, 1, h, w) float32 on the poses' device."""

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torch_ecc.pose import rotation
 
-LOWEST = 0.05  # lowest frequency of a random scene over its highest: keeps amplitudes ~ 1/f clear of the pole
-CLEARANCE = 4.0  # standard deviations that must fit between the mean and both ends of the scale
+LOWEST = 0.1  # lowest frequency of a random scene over its highest: keeps amplitudes ~ 1/f clear of the pole
+CLEARANCE = 5.0  # standard deviations that must fit between the mean and both ends of the scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +44,12 @@ class PlaneWaves:
         spectrum: Literal["natural", "fine"] = "natural",
         seed: int = 0,
     ) -> PlaneWaves:
-        """Isotropic texture of ``count`` waves with frequencies spread evenly from fmax / 20 to ``fmax`` cycles per px.
+        """Isotropic texture of ``count`` waves with frequencies spread evenly from fmax / 10 to ``fmax`` cycles per px.
 
         ``rms_gradient``, grey levels per px, is the root mean square over the plane of one component of the gradient
         (mean of both components' squares). ``natural`` has amplitudes ~ 1/f: coarse and fine waves share the gradient
         equally; ``fine`` has equal amplitudes. The same seed gives the same scene on every machine. ValueError if the
-        numbers are not positive, or if the texture would not fit into 0..255 around ``mean`` (4 standard deviations);
+        numbers are not positive, or if the texture would not fit into 0..255 around ``mean`` (5 standard deviations);
         a ``mean`` of 0 makes a layer for a ``Sum``, whose range is not checked.
         """
         _check_random(count, fmax, rms_gradient, spectrum)
