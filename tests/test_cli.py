@@ -216,3 +216,23 @@ def test_help_is_quick_and_names_the_commands():
     assert shown.returncode == 0
     assert "demo" in shown.stdout
     assert "track" in shown.stdout
+
+
+def test_simulate_and_track_what_was_simulated(tmp_path):
+    config = tmp_path / "small.toml"
+    config.write_text(
+        '[scene]\nkind = "waves"\n[motion]\namplitudes_deg = [5, 5, 2]\npoints = 6\nlead_in = 4\n'
+        "[camera]\nsize = [120, 160]\n[template]\nsize = 41\n"
+    )
+    out = tmp_path / "sequence"
+    made = CliRunner().invoke(app, ["simulate", str(config), "--out", str(out)])
+    assert made.exit_code == 0, made.output
+    command = made.output.splitlines()[-1].split()
+    tracked = CliRunner().invoke(app, [*command[1:], "--out", str(tmp_path / "track"), "--no-overlay"])
+    assert tracked.exit_code == 0, tracked.output
+    with np.load(tmp_path / "track" / "track.npz") as track, (out / "poses.csv").open() as file:
+        truth = [[float(row[name]) for name in ("x_px", "y_px", "theta_rad")] for row in csv.DictReader(file)]
+        assert np.abs(track["pose"][:, 0] - np.array(truth)).max() < 0.01
+    again = CliRunner().invoke(app, ["simulate", str(config), "--out", str(out)])
+    assert isinstance(again.exception, ValueError)
+    assert "folder must be empty or new" in str(again.exception)

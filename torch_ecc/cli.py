@@ -87,6 +87,26 @@ def track(config: str | None, size: str | None, polygons: tuple[str, ...], **opt
         sys.exit(INTERRUPTED)
 
 
+@app.command()
+@click.argument("config", type=click.Path())
+@click.option("--out", default="torch-ecc-sequence", show_default=True, help="Folder for the sequence, new or empty.")
+def simulate(config: str, out: str) -> None:
+    """Render a sequence whose motion is known exactly, as images, poses.csv and metadata.json.
+
+    CONFIG is a TOML file such as configs/simulate.toml.
+    """
+    from torch_ecc.sim import from_config, save
+
+    simulation = from_config(read_toml(config), folder=Path(config).parent)
+    sequence, template = simulation.sequence, simulation.template
+    with progress_bar("simulate", len(sequence)) as advance:
+        save(sequence, out, metadata=simulation.metadata, progress=advance)
+    x, y = template.center or (0.0, 0.0)
+    h, w = template.size
+    console.print(f"{len(sequence)} frames in {out}/. To track them:")
+    console.print(f"  torch-ecc track {out}/frames --center {x:g} {y:g} --size {w}x{h}", soft_wrap=True)
+
+
 def _size(text: str) -> int | list[int]:
     parts = text.lower().split("x")
     if not (1 <= len(parts) <= 2 and all(part.strip().isdecimal() for part in parts)):
