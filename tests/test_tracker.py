@@ -187,7 +187,7 @@ def test_texture_predicts_the_scatter():
     predicted = texture(shot(), centers, 61, noise=noise)
     errors = torch.stack([Tracker(shot(), centers, 61)(shot()).displacement for _ in range(8)])
     ratio = errors.square().mean((0, 1)).sqrt() / predicted.square().mean(0).sqrt()
-    assert ((ratio > 0.85) & (ratio < 1.15)).all(), ratio
+    assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
 
 
 def test_texture_says_which_patch_is_better():

@@ -14,40 +14,46 @@ from torch_ecc.solver import Settings, State, warps
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
 NOISE_SHARE = 0.8  # of the information in some direction is the template's noise: not even a good match helps
-BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
 DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
 
 
 def judge(reference: Reference, size: tuple[int, int], state: State, start: Tensor, settings: Settings) -> Estimate:
     """The record of B solved templates in a frame of ``size`` (h, w); failed ones get their ``start`` (B, 3) back."""
-    pose = state.pose
-    seen = inside(warps(reference, pose), reference.pixels, size)
-    visible = (reference.weight * seen).sum(-1) / reference.weight.sum(-1)
-    _, textured = information(reference, reference.noise.to(pose.dtype) ** 2, DOUBTFUL_SHARE)
-    if not bool(seen.all()):
-        reference = reweigh(reference, seen)
-    weight = reference.weight
-    residual, gain = (v.to(pose.dtype) for v in reference.criterion.fit(reference, state.patch))
-    power = (weight * residual * residual).sum(-1) / weight.sum(-1).clamp(min=1e-30)
-    score = correlation(reference.signal[:, 3], state.patch, weight).to(pose.dtype)
+    pose, whole = state.pose, reference
+    warp, visible = warps(reference, pose), torch.ones_like(pose[:, 0])
+    if not bool(inside(warp, reference.box, size).all()):
+        reference = reweigh(reference, inside(warp, reference.pixels, size))
+        visible = (reference.weight.sum(-1) / whole.weight.sum(-1)).to(pose.dtype)
+    residual, gain = reference.criterion.fit(reference, state.patch)
+    gain = gain.to(pose.dtype)
+    power = (reference.weight * residual * residual).sum(-1) / reference.weight.sum(-1).clamp(min=1e-30)
+    power = power.to(pose.dtype)
+    score = correlation(reference.signal[:, 3], state.patch, reference.weight).to(pose.dtype)
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
     structure = clustering(reference, residual, power)
     covariance, fixed = pose_covariance(reference, noise, gain, pose, structure)
-    good_match = (score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
-    status = torch.full_like(score, Status.CONVERGED, dtype=torch.int8)
-    for code, found in (  # from the least to the most telling
-        (Status.MAX_ITERATIONS, state.error > settings.tolerance),
-        (Status.LOW_TEXTURE, ~fixed),
-        (Status.LOST, ~good_match),
-        (Status.OUT_OF_VIEW, ~(visible >= settings.min_visible)),
-        (Status.LOW_TEXTURE, ~(good_match & (visible >= settings.min_visible)) & ~textured),
-    ):
-        status = torch.where(found, torch.full_like(status, code), status)
+    shown = visible >= settings.min_visible
+    match = (score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
+    status = decide(whole, shown, match, fixed, state.error <= settings.tolerance)
     good = Status.good(status)
     pose = torch.where(good[:, None], pose, start)
     unknown = torch.full_like(pose, float("inf")).diag_embed()
     covariance = torch.where(good[:, None, None], covariance, unknown)
     return Estimate(pose, pose - start, score, status, state.iterations, covariance, power.sqrt())
+
+
+def decide(reference: Reference, shown: Tensor, match: Tensor, fixed: Tensor, converged: Tensor) -> Tensor:
+    """Status codes (B,) int8 from what was found, (B,) bool each: enough of it is ``shown``, it is a ``match``, its
+    texture has ``fixed`` the pose, the iterations have ``converged``."""
+    status = torch.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
+    status = torch.where(fixed, status, int(Status.LOW_TEXTURE))
+    status = torch.where(match, status, int(Status.LOST))
+    status = torch.where(shown, status, int(Status.OUT_OF_VIEW))
+    failed = ~(match & shown)
+    if bool(failed.any()):  # a template without texture of its own is why
+        _, textured = information(reference, reference.noise.to(reference.slope.dtype) ** 2, DOUBTFUL_SHARE)
+        status = torch.where(failed & ~textured, int(Status.LOW_TEXTURE), status)
+    return status.to(torch.int8)
 
 
 def correlation(t: Tensor, g: Tensor, weight: Tensor) -> Tensor:
@@ -84,14 +90,12 @@ def clustering(reference: Reference, residual: Tensor, power: Tensor) -> Tensor:
     together where the gradients are. Their effect summed block by block tells the scatter that they bring (the
     cluster-robust sandwich); 1 where it is not more than the white one's.
     """
-    K = reference.K[:, :3].to(residual.dtype)
-    column, row = ((reference.pixels[:2] - reference.box[:2, :1]) / BLOCK).long()
-    block = row * int(column.max() + 1) + column
-    blocks = int(block.max() + 1)
-    sums = K.new_zeros(len(K), 3, blocks).index_add_(2, block, K * residual[:, None])
+    K = reference.K[:, :3]
+    blocks = int(reference.block[-1]) + 1
+    sums = K.new_zeros(len(K), 3, blocks).index_add_(2, reference.block, K * residual[:, None])
     few = blocks / max(blocks - reference.K.shape[1], 1)  # blocks are not free: the fit has made their sum zero
-    white = K.square().sum(-1) * power[:, None]
-    return (few * sums.square().sum(-1) / white.clamp(min=1e-30)).clamp(min=1.0).sqrt()
+    white = K.square().sum(-1).to(power.dtype) * power[:, None]
+    return (few * sums.square().sum(-1).to(power.dtype) / white.clamp(min=1e-30)).clamp(min=1.0).sqrt()
 
 
 def pose_covariance(

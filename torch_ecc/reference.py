@@ -29,6 +29,7 @@ from torch_ecc.sampling import blur, gradients, noise_level, pad
 INSTRUMENT_BLUR = 0.8  # px; 0.7 to 1 serve alike
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
 LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
+BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
 SMALLEST = 5  # px: side of the smallest template
 
 
@@ -36,9 +37,10 @@ class Reference(NamedTuple):
     """B prepared templates of N pixels under a criterion of p columns.
 
     ``pixels`` (3, N) homogeneous pixel positions relative to the middle of the template array; ``box`` (3, 4) the
-    corners of their bounding box; ``centre`` (B, 2) the point x' = 0 in the same coordinates; ``radius`` (B,) px from
-    there to the farthest pixel; ``noise`` (B,) upper estimate of the template's noise, grey levels; ``signal`` and
-    ``instrument`` (B, 4, N) = [G, t] raw and blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
+    corners of their bounding box; ``block`` (N,) the number of the block of neighbours that a pixel is in; ``centre``
+    (B, 2) the point x' = 0 in the pixels' coordinates; ``radius`` (B,) px from there to the farthest pixel; ``noise``
+    (B,) upper estimate of the template's noise, grey levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and
+    blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
 
     For the covariance, each (B, 3, 3): ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other columns,
     and ``inflation``, what white noise of unit variance in the template adds to ``slope``.
@@ -47,6 +49,7 @@ class Reference(NamedTuple):
     criterion: Criterion
     pixels: Tensor
     box: Tensor
+    block: Tensor
     centre: Tensor
     radius: Tensor
     noise: Tensor
@@ -68,7 +71,7 @@ class Reference(NamedTuple):
         """The reference of the templates at ``index`` (n,)."""
         if len(index) == len(self.K):
             return self
-        shared = {"criterion", "pixels", "box"} | ({"weight"} if len(self.weight) == 1 else set())
+        shared = {"criterion", "pixels", "box", "block"} | ({"weight"} if len(self.weight) == 1 else set())
         return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
@@ -129,7 +132,9 @@ def _assemble(criterion: Criterion, sharp: Tensor, soft: Tensor, kept: Tensor, c
     contrast = centred(signal[:, 3], weight)[1] / weight.sum(-1).sqrt()
     noise = torch.maximum(noise_level(sharp[:, 2:], kept), LEAST_NOISE * contrast)
     nothing = radius.new_zeros(len(sharp), 3, 3)
-    constants = (pixels, box, centre, radius, noise, signal, instrument, weight)
+    column, row = ((pixels[:2] - box[:2, :1]) / BLOCK).long()
+    block = row * (int(column.max()) + 1) + column
+    constants = (pixels, box, block, centre, radius, noise, signal, instrument, weight)
     return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing), weight > 0)
 
 
