@@ -17,6 +17,7 @@ from torch_ecc.experiments.accuracy import Draws, Harmonic, scatter, track_path,
 from torch_ecc.sim.camera import Camera
 from torch_ecc.sim.light import GradientLight, SpotLight
 from torch_ecc.sim.pads import Pads
+from torch_ecc.sim.sequence import Sequence
 from torch_ecc.sim.waves import PlaneWaves
 
 SCENES = {"waves": PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0), "pads": Pads.wafer()}
@@ -65,12 +66,12 @@ def sequences() -> None:
     scene = SCENES["waves"]
     for noise in (0.0, 2.0, 5.0, 10.0):
         camera = Camera(noise_sigma=noise)
-        run = track_path(scene, camera, Harmonic().path(camera))
+        run = track_path(Sequence(scene, Harmonic().path(camera), camera))
         rows.append(("eq. (11), 20 px, 5 deg", f"{noise:g}", *_cells(run)))
     angles = torch.arange(0, 722, 2) * math.pi / 180
     camera = Camera(size=(221, 221))
     path = torch.stack((110 + 0 * angles, 110 + 0 * angles, angles), -1).double()
-    rows.append(("0 to 720 deg in steps of 2", "0", *_cells(track_path(scene, camera, path))))
+    rows.append(("0 to 720 deg in steps of 2", "0", *_cells(track_path(Sequence(scene, path, camera)))))
     show("Sequences, 8 bit", ("motion", "noise", "rms px", "rms deg", "largest px", "largest deg", "lost"), rows)
 
 

@@ -9,6 +9,7 @@ import torch
 
 from torch_ecc import Status
 from torch_ecc.experiments.accuracy import Draws, Harmonic, scatter, track_path, under_light
+from torch_ecc.sim import Sequence
 from torch_ecc.sim.camera import Camera
 from torch_ecc.sim.light import GradientLight, SpotLight
 from torch_ecc.sim.waves import PlaneWaves
@@ -34,7 +35,7 @@ def test_scatter_reaches_the_bound_and_the_covariance_says_so(noise, turn):
 def test_noise_free_sequence_of_equation_11():
     """20 px and 5 deg, 8 bit: at most 0.001 px and 0.001 deg rms, 0.003 at most."""
     camera = Camera(size=(221, 221))
-    run = track_path(SCENE, camera, Harmonic(20.0, 5.0, 40).path(camera))
+    run = track_path(Sequence(SCENE, Harmonic(20.0, 5.0, 40).path(camera), camera))
     assert (run.status == Status.CONVERGED).all()
     assert max(run.rms) < 0.001
     assert max(run.largest) < 0.003
@@ -44,7 +45,7 @@ def test_two_full_turns():
     """Theta from 0 to 720 deg in steps of 2 deg, unwrapped, as exact at every angle."""
     angles = torch.arange(0, 722, 2) * math.pi / 180
     path = torch.stack((110 + 0 * angles, 110 + 0 * angles, angles), -1).double()
-    run = track_path(SCENE, Camera(size=(221, 221)), path)
+    run = track_path(Sequence(SCENE, path, Camera(size=(221, 221))))
     assert (run.status == Status.CONVERGED).all()
     assert max(run.rms) < 0.001
     assert max(run.largest) < 0.003

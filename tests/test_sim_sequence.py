@@ -206,6 +206,14 @@ def test_degrees_are_radians_by_another_name():
         torch.testing.assert_close(a.sequence.poses, b.sequence.poses)
 
 
+def test_a_saved_motion_can_be_replayed(tmp_path):
+    made = from_config({"motion": {"points": 5, "lead_in": 3}, "camera": {"size": [200, 220]}})
+    save(made.sequence, tmp_path / "a")
+    motion = {"kind": "file", "path": "a/poses.csv", "center": [0, 0], "lead_in": 0}
+    again = from_config({"motion": motion, "camera": {"size": [200, 220]}}, folder=tmp_path)
+    assert torch.equal(again.sequence.poses, made.sequence.poses)
+
+
 def test_settings_reach_the_camera():
     camera = from_config({"camera": {"noise_variance": 0.001, "bits": "float", "drift": {}}}).sequence.camera
     assert camera.noise_sigma == pytest.approx(255 * 0.001**0.5)

@@ -62,21 +62,8 @@ class Estimate(NamedTuple):
         return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
 
-class Track(NamedTuple):
+class Track(Estimate):
     """The fields of Estimate stacked over F frames: (F, R, ...)."""
-
-    pose: Tensor
-    displacement: Tensor
-    score: Tensor
-    status: Tensor
-    iterations: Tensor
-    covariance: Tensor
-    residual_rms: Tensor
-
-    @property
-    def sigma(self) -> Tensor:
-        """Standard deviations of the poses: (F, R, 3) px, px, rad."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
     @staticmethod
     def stack(estimates: Sequence[Estimate]) -> Track:

@@ -19,6 +19,7 @@ from torch_ecc.sim.camera import Camera
 from torch_ecc.sim.light import Light
 from torch_ecc.sim.motion import harmonic, placed
 from torch_ecc.sim.scene import Scene
+from torch_ecc.sim.sequence import Sequence
 from torch_ecc.tracker import Tracker
 
 SIZE = 121  # px, the paper's template
@@ -127,20 +128,13 @@ class Run(NamedTuple):
         return int((~Status.good(self.status)).sum())
 
 
-def track_path(
-    scene: Scene, camera: Camera, path: Tensor, *, options: Mapping[str, Any] | None = None, seed: int = 0
-) -> Run:
-    """Errors of a Tracker with ``options`` whose template is cut at the scene's origin in the first frame of ``path``.
-
-    ``path`` (F + 1, 3); frame by frame, so that memory does not grow with F.
-    """
-    first = camera.capture(scene, path[:1], seed=seed)[0, 0]
-    start = torch.cat((path[:1, :2], path.new_zeros(1, 1)), 1)
-    truth = compose(path, compose(inverse(path[:1]), start).expand_as(path))[1:]
-    tracker = Tracker(first, start[:, :2], SIZE, **(options or {}))
-    frames = (camera.capture(scene, path[k : k + 1], seed=seed, first=k)[0, 0] for k in range(1, len(path)))
+def track_path(sequence: Sequence, options: Mapping[str, Any] | None = None) -> Run:
+    """Errors of a Tracker with ``options`` whose template is cut at the scene's origin in frame 0, from frame 1 on."""
+    center = sequence.poses[:1, :2]
+    frames = iter(sequence)
+    tracker = Tracker(next(frames), center, SIZE, **(options or {}))
     track = tracker.track_sequence(frames)
-    return Run(track.pose[:, 0] - truth, track.status[:, 0])
+    return Run(track.pose[:, 0] - sequence.truth(center)[1:, 0], track.status[:, 0])
 
 
 LIGHT_METHODS = {
@@ -155,5 +149,5 @@ LIGHT_METHODS = {
 def under_light(scene: Scene, light: Light | None, motion: Harmonic) -> dict[str, Run]:
     """Each method's errors under ``light`` (none: even light), noise-free and unquantised."""
     camera = Camera(light=light, bits=None)
-    path = motion.path(camera)
-    return {name: track_path(scene, camera, path, options=options) for name, options in LIGHT_METHODS.items()}
+    sequence = Sequence(scene, motion.path(camera), camera)
+    return {name: track_path(sequence, options) for name, options in LIGHT_METHODS.items()}

@@ -20,12 +20,12 @@ from torch_ecc.calibration import Calibration
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.io import OverlayWriter, TrackWriter
 from torch_ecc.plots import plot_track
-from torch_ecc.pose import compose, inverse
 from torch_ecc.session import STATUS_NAMES
 from torch_ecc.sim.camera import Camera
 from torch_ecc.sim.light import GradientLight
 from torch_ecc.sim.micrograph import micrograph
 from torch_ecc.sim.motion import harmonic, placed
+from torch_ecc.sim.sequence import Sequence
 from torch_ecc.tracker import Tracker
 
 SIZE = 121  # px, the paper's template
@@ -65,19 +65,17 @@ def _cells(pose: Tensor) -> list[str]:
 
 def run_demo(out: Path, frames: int, advance: Callable[[int, int], None]) -> DemoResult:
     """Render, track with both methods at once and write their outputs; ``advance(done, total)`` tells how far it is."""
-    scene, camera = micrograph(), Camera(light=GradientLight(), noise_sigma=NOISE)
+    camera = Camera(light=GradientLight(), noise_sigma=NOISE)
     h, w = camera.size
     path = placed(harmonic(AMPLITUDES, frames), (w / 2, h / 2))
-    first = camera.capture(scene, path[:1])[0, 0]
-    center = path[0, :2]
-    start = torch.cat((center, center.new_zeros(1)))[None]
-    truth = compose(path, compose(inverse(path[:1]), start).expand_as(path))  # the template is cut at theta = 0
-    trackers = {name: Tracker(first, center[None], SIZE, criterion=name) for name in PAPER}
+    sequence = Sequence(micrograph(), path, camera)
+    first, center = sequence.batch(0, 1)[0, 0], path[:1, :2]
+    truth = sequence.truth(center)[:, 0]
+    trackers = {name: Tracker(first, center, SIZE, criterion=name) for name in PAPER}
     poses: dict[str, list[Estimate]] = {name: [] for name in PAPER}
     with ExitStack() as stack:
         writers = {name: _open(stack, out / name) for name in PAPER}
-        for k in range(frames):
-            frame = camera.capture(scene, path[k : k + 1], first=k)[0, 0]
+        for k, frame in enumerate(sequence):
             for name, tracker in trackers.items():
                 estimate = tracker(frame)
                 poses[name].append(estimate)
