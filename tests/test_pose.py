@@ -31,6 +31,7 @@ def test_group_laws(a, b, c):
     assert torch.allclose(P.compose(P.compose(a, b), c), P.compose(a, P.compose(b, c)), atol=1e-9)
     assert torch.allclose(P.compose(a, P.inverse(a)), torch.zeros(3, dtype=torch.float64), atol=1e-9)
     assert torch.allclose(P.matrix(P.compose(a, b)), P.matrix(a) @ P.matrix(b), atol=1e-9)
+    assert torch.allclose(P.retract(a, b), P.compose(a, P.inverse(b)), atol=1e-9)
     points = torch.tensor([[3.0, -4.0], [0.5, 9.0]], dtype=torch.float64)
     assert torch.allclose(P.transform(P.compose(a, b), points), P.transform(a, P.transform(b, points)), atol=1e-9)
 

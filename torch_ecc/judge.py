@@ -51,8 +51,8 @@ def decide(reference: Reference, shown: Tensor, match: Tensor, fixed: Tensor, co
     status = torch.where(shown, status, int(Status.OUT_OF_VIEW))
     failed = ~(match & shown)
     if bool(failed.any()):  # a template without texture of its own is why
-        _, textured = information(reference, reference.noise.to(reference.slope.dtype) ** 2, DOUBTFUL_SHARE)
-        status = torch.where(failed & ~textured, int(Status.LOW_TEXTURE), status)
+        empty = reference.noise.square() * reference.noise_share > DOUBTFUL_SHARE
+        status = torch.where(failed & empty, int(Status.LOW_TEXTURE), status)
     return status.to(torch.int8)
 
 
@@ -62,18 +62,6 @@ def correlation(t: Tensor, g: Tensor, weight: Tensor) -> Tensor:
     norm = dt * dg
     score = (weight * t0 * g0).sum(-1) / norm.clamp(min=1e-30)
     return torch.where(norm > 1e-12 * (weight * g * g).sum(-1), score, 0.0).clamp(-1, 1)
-
-
-def information(reference: Reference, noise: Tensor, share: float = NOISE_SHARE) -> tuple[Tensor, Tensor]:
-    """``slope`` (B, 3, 3) less what a template noise of variance ``noise`` (B,) adds to it; and whether that noise is
-    less than ``share`` of it in every direction, (B,) bool."""
-    slope = reference.slope - noise[:, None, None] * reference.inflation
-    excess = slope - (1 - share) * reference.slope
-    unit = reference.radius.new_ones(len(slope), 3)
-    unit[:, 2] = 1 / reference.radius  # theta in px at the farthest pixel
-    scaled = (excess + excess.mT) * unit[:, :, None] * unit[:, None, :]
-    _, failed = torch.linalg.cholesky_ex(scaled)
-    return slope, (failed == 0) & (scaled.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
 
 
 def noise_variance(reference: Reference, power: Tensor, gain: Tensor, sampled: float) -> Tensor:
@@ -107,8 +95,9 @@ def pose_covariance(
     Sandwich of the instrumental-variable estimate: (1 + 1 / gain^2) v S^-1 (Z~ Z~^T) S^-T, turned from the template's
     axes to the frame's. S is freed of the template noise in it. ``structure`` (B, 3): see ``clustering``.
     """
-    slope, textured = information(reference, torch.minimum(noise, reference.noise.to(noise.dtype) ** 2))
-    inverse, regular = safe_inverse(slope)
+    own = torch.minimum(noise, reference.noise.to(noise.dtype) ** 2)
+    inverse, regular = safe_inverse(reference.slope - own[:, None, None] * reference.inflation)
+    textured = own * reference.noise_share < NOISE_SHARE
     local = inverse @ reference.spread @ inverse.mT * (noise * (1 + 1 / (gain * gain).clamp(min=1e-12)))[:, None, None]
     if structure is not None:
         local = local * structure[:, :, None] * structure[:, None, :]

@@ -69,6 +69,12 @@ def inverse(pose: Tensor) -> Tensor:
     return torch.cat((t, -pose[..., 2:]), -1)
 
 
+def retract(pose: Tensor, increment: Tensor) -> Tensor:
+    """W(p) o W(dp)^-1, the inverse compositional update (eq. 10) in closed form: (B, 3), (B, 3) -> (B, 3)."""
+    theta = pose[..., 2:] - increment[..., 2:]
+    return torch.cat((pose[..., :2] - (rotation(theta[..., 0]) @ increment[..., :2, None])[..., 0], theta), -1)
+
+
 def unwrap(theta: Tensor, reference: Tensor) -> Tensor:
     """``theta`` moved by whole turns to within half a turn of ``reference``; same shape, rad."""
     return theta - tau * torch.round((theta - reference) / tau)

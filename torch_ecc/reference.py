@@ -43,7 +43,8 @@ class Reference(NamedTuple):
     blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
 
     For the covariance, each (B, 3, 3): ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other columns,
-    and ``inflation``, what white noise of unit variance in the template adds to ``slope``.
+    and ``inflation``, what white noise of unit variance in the template adds to ``slope``; ``noise_share`` (B,) is the
+    largest part of ``slope`` that such noise can be, in any direction.
     """
 
     criterion: Criterion
@@ -60,6 +61,13 @@ class Reference(NamedTuple):
     slope: Tensor
     spread: Tensor
     inflation: Tensor
+    noise_share: Tensor
+
+    @property
+    def lever(self) -> Tensor:
+        """What turns an increment into px at the farthest pixel, (B, 3)."""
+        one = torch.ones_like(self.radius)
+        return torch.stack((one, one, self.radius), -1)
 
     @property
     def uv(self) -> Tensor:
@@ -135,7 +143,7 @@ def _assemble(criterion: Criterion, sharp: Tensor, soft: Tensor, kept: Tensor, c
     column, row = ((pixels[:2] - box[:2, :1]) / BLOCK).long()
     block = row * (int(column.max()) + 1) + column
     constants = (pixels, box, block, centre, radius, noise, signal, instrument, weight)
-    return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing), weight > 0)
+    return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing, radius), weight > 0)
 
 
 def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:
@@ -156,13 +164,28 @@ def reweigh(reference: Reference, seen: Tensor) -> Reference:
     others, _ = safe_inverse(normal[:, 3:, 3:])
     project = torch.eye(3, dtype=dtype, device=weight.device).expand(len(R), 3, 3)
     project = torch.cat((project, -normal[:, :3, 3:] @ others), -1)
+    slope = (project @ normal)[:, :, :3] * regular[:, None, None]
+    inflation = _noise_slope(reference, weight) * noise_response()
     return reference._replace(
         weight=weight,
         K=(inverse @ ZW.to(dtype)).to(R.dtype),
-        slope=(project @ normal)[:, :, :3] * regular[:, None, None],
+        slope=slope,
         spread=project @ power @ project.mT,
-        inflation=_noise_slope(reference, weight) * noise_response(),
+        inflation=inflation,
+        noise_share=_largest_share(slope, inflation),
     )
+
+
+def _largest_share(slope: Tensor, inflation: Tensor) -> Tensor:
+    """Largest eigenvalue of slope^-1 inflation, (B,), infinite where the slope is singular.
+
+    By a high power of the matrix, to 7 % from above, which an eigenvalue solver would not do without synchronising.
+    """
+    inverse, regular = safe_inverse(slope)
+    share = inverse @ inflation
+    scale = share.abs().amax((-2, -1), keepdim=True).clamp(min=1e-30)
+    power = torch.linalg.matrix_power(share / scale, 16).diagonal(dim1=-2, dim2=-1).sum(-1)
+    return torch.where(regular & (power > 0), power.clamp(min=0) ** (1 / 16) * scale[:, 0, 0], torch.inf)
 
 
 def safe_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:

@@ -62,15 +62,12 @@ class BSpline(NamedTuple):
         points = local.to(pixels.dtype) @ pixels
         scale, shift = _unit_square(*self.coefficients.shape[-2:], points.dtype, points.device)
         floor = points.floor()
-        weights = _weights(points - floor, self.degree)
-        columns = []  # per pair of taps: total weight and normalised coordinate of their lookup, both (B, 2, N)
-        for first in range(0, self.degree + 1, 2):
-            total = weights[first] + weights[first + 1]
-            position = floor + (first - self.degree // 2) + weights[first + 1] / total
-            columns.append((total, position * scale + shift))
+        pairs = []  # per pair of taps: total weight and normalised coordinate of their lookup, both (B, 2, N)
+        for first, total, second in _pairs(points - floor, self.degree):
+            pairs.append((total, (floor + (second / total + first)).mul_(scale).add_(shift)))
         values = torch.zeros_like(points[:, 0])
-        for wx, x in columns:
-            for wy, y in columns:
+        for wx, x in pairs:
+            for wy, y in pairs:
                 look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), 1))
                 values.addcmul_(look, wx[:, 0] * wy[:, 1])
         return values
@@ -100,9 +97,9 @@ def make_sampler(interpolation: str, image: Tensor, warp: Tensor, box: Tensor) -
     extent = int((corners.amax(-1).ceil() + REACH - low).amax()) + 1
     side = -(-extent // 16) * 16  # few different sizes, so that the prefilter matrices are reused
     shared = len(image) == 1 and len(warp) * 2 * side**3 >= h * w * (h + w)
-    if shared or side >= max(h, w) or not low.isfinite().all():
+    if shared or side > min(h, w):
         return BSpline(prefilter(image, degree), warp.new_zeros(1, 2), degree)
-    low = torch.minimum(low, low.new_tensor((w - 1.0 + REACH, h - 1.0 + REACH))).clamp(min=-side)
+    low = torch.minimum(low, low.new_tensor((w - side, h - side))).clamp(min=0)  # what lies beyond is not sampled
     return BSpline(prefilter(_crop(image, low.long(), side), degree), low, degree)
 
 
@@ -114,12 +111,10 @@ def inside(warp: Tensor, pixels: Tensor, size: tuple[int, int], margin: float = 
 
 
 def _crop(image: Tensor, origin: Tensor, side: int) -> Tensor:
-    """Squares (B, 1, side, side) of ``image`` from ``origin`` (B, 2) = (x, y); beyond the border the image mirrors."""
-    run = torch.arange(side, device=image.device)
-    x = _mirror(origin[:, :1] + run, image.shape[-1])
-    y = _mirror(origin[:, 1:] + run, image.shape[-2])
-    which = torch.arange(len(image), device=image.device)[:, None, None]
-    return image[which, 0, y[:, :, None], x[:, None, :]][:, None]
+    """Squares (B, 1, side, side) of ``image`` (1 or B, 1, H, W) from ``origin`` (B, 2) = (x, y), all inside it."""
+    windows = image[:, 0].unfold(1, side, 1).unfold(2, side, 1)  # a view: every square there is
+    which = torch.arange(len(image), device=image.device)
+    return windows[which, origin[:, 1], origin[:, 0]][:, None]
 
 
 def _mirror(index: Tensor, size: int) -> Tensor:
@@ -141,13 +136,16 @@ def _lookup(image: Tensor, points: Tensor) -> Tensor:
     return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[:, 0, 0]
 
 
-def _weights(f: Tensor, degree: int) -> list[Tensor]:
-    """B-spline weights of the degree + 1 taps around a point with fractional part ``f``, any shape."""
+def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
+    """Pairs of neighbouring taps around a point with fractional part ``f``, any shape: the first one's offset, the
+    sum of both weights and the second one's weight."""
     r = 1 - f
     if degree == 3:
-        f2, r2 = f * f, r * r
-        return [r2 * r / 6, 2 / 3 - f2 * (1 - f / 2), 2 / 3 - r2 * (1 - r / 2), f2 * f / 6]
-    return [
+        left, right = r**3 / 6, f**3 / 6
+        high = torch.addcmul(2 / 3 + 3 * left, r, r, value=-1) + right
+        low = 1 - high
+        return [(-1, low, low - left), (1, high, right)]
+    w = [
         r**5 / 120,
         ((1 + r) ** 5 - 6 * r**5) / 120,
         ((2 + r) ** 5 - 6 * (1 + r) ** 5 + 15 * r**5) / 120,
@@ -155,6 +153,7 @@ def _weights(f: Tensor, degree: int) -> list[Tensor]:
         ((1 + f) ** 5 - 6 * f**5) / 120,
         f**5 / 120,
     ]
+    return [(k - 2, w[k] + w[k + 1], w[k + 1]) for k in (0, 2, 4)]
 
 
 @lru_cache(maxsize=64)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.pose import compose, inverse, rotation
+from torch_ecc.pose import retract, rotation
 from torch_ecc.reference import Reference, reweigh
 from torch_ecc.sampling import Sampler, inside, make_sampler
 
@@ -89,13 +89,12 @@ def gauss_newton(reference: Reference, sample: Sampler, state: State, tolerance:
     g = sample(warp, reference.pixels)  # I(W(p_k; x'))
     seen = reference if sample.edge is None else reweigh(reference, inside(warp, reference.pixels, sample.edge))
     increment = seen.criterion.step(seen, g).to(pose.dtype)  # eq. (9), or a better one
-    lever = torch.stack((torch.ones_like(reference.radius), torch.ones_like(reference.radius), reference.radius), -1)
-    delta = increment * lever
+    delta = increment * reference.lever
     length = torch.linalg.vector_norm(delta, dim=-1)
     moving = length.isfinite() & (state.error > tolerance)
     factor, rate = secant(state, delta, length)
     stretch = torch.minimum(factor, LONGEST_STEP * reference.radius / length.clamp(min=1e-12))
-    moved = compose(pose, inverse(increment * stretch[:, None]))  # eq. (10)
+    moved = retract(pose, increment * stretch[:, None])  # eq. (10)
     return State(
         torch.where(moving[:, None], moved, pose),
         torch.where(moving[:, None], delta, state.delta),
@@ -112,10 +111,10 @@ def secant(state: State, delta: Tensor, length: Tensor) -> tuple[Tensor, Tensor]
     Noise in the template shortens every step by one factor, so that steps shrink in a geometric series. Two of them
     tell its sum (the secant method on their common line). Only near the answer: far from it steps are no such series.
     """
-    square = state.delta.square().sum(-1)
-    rate = torch.where(square > 0, length / square.sqrt(), 0.5).clamp(0.05, 0.95)
-    along = (state.delta * delta).sum(-1) / square.clamp(min=1e-30)  # = 1 - (last stretch) * (share that a step covers)
-    usable = (square > 0) & (along > 0) & (along < 0.9) & (square < SECANT_RANGE**2)
+    last = torch.linalg.vector_norm(state.delta, dim=-1)
+    rate = torch.where(last > 0, length / last, 0.5).clamp(0.05, 0.95)
+    along = (state.delta * delta).sum(-1) / (last * last)  # = 1 - (last stretch) * (share that a step covers)
+    usable = (last < SECANT_RANGE) & (along < 0.9)  # NaN at the first step is not
     return torch.where(usable, (state.factor / (1 - along)).clamp(1.0, LARGEST_STRETCH), 1.0), rate
 
 
