@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ecc import Calibration, Tracker, align, calibrate, prepare, texture
+from torch_ecc import ECC, Calibration, Tracker, align, calibrate, prepare, texture
 
 FRAME = (100 * torch.rand(100, 120, generator=torch.Generator().manual_seed(0)) + 50).to(torch.uint8)
 GOOD = {"frame": FRAME, "centers": [(60.0, 50.0)], "size": 31}
@@ -105,7 +105,13 @@ CALLS = {
         r"prediction: expected one of \['hold', 'velocity'\], got 'kalman'",
     ),
     "levels": (lambda: tracker(levels=4), "levels: expected 1 to 2 for templates of 31x31 px, got 4"),
-    "iterations": (lambda: tracker(max_iterations=0), "max_iterations: expected at least 1, got 0"),
+    "iterations": (lambda: tracker(max_iterations=0), "max_iterations: expected a whole number of at least 1, got 0"),
+    "iterations float": (lambda: tracker(max_iterations=15.0), "max_iterations: expected a whole number .*, got 15.0"),
+    "levels float": (lambda: tracker(levels=2.0), "levels: expected 1 to 2 .*, got 2.0"),
+    "criterion class": (lambda: tracker(criterion=ECC), "criterion: expected a name or an object with columns, step"),
+    "criterion none": (lambda: tracker(criterion=None), "criterion: expected a name or an object .*, got None"),
+    "align template": (lambda: align(FRAME, FRAME, POSE), "align: reference must come from prepare, got Tensor"),
+    "prepare centre": (lambda: prepare(FRAME, centre=torch.zeros(3)), r"prepare: centre must be \(1, 2\), got \(3,\)"),
     "tolerance": (lambda: tracker(tolerance=0.0), "tolerance: expected a length in px > 0, got 0"),
     "tolerance nan": (lambda: tracker(tolerance=math.nan), "tolerance: expected a length in px > 0, got nan"),
     "min_score": (lambda: tracker(min_score=2.0), "min_score: expected a number from 0 to 1, got 2"),

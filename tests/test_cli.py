@@ -144,13 +144,16 @@ def wrong(tmp_path) -> dict[str, tuple[list[str], str]]:
             r"expected one per center (1), got 2",
         ),
         "zero scale": ([*good, "--um-per-px", "0"], "um_per_px: expected one or two finite numbers other than 0"),
-        "zero fps": ([*good, "--fps", "0"], "fps must be a positive number"),
+        "zero fps": ([*good, "--fps", "0"], "fps: expected a rate > 0 in Hz, got 0"),
         "criterion": ([*good, "--criterion", "magic"], "criterion: expected one of"),
         "levels": ([*good, "--levels", "9"], "levels: expected 1 to 2"),
         "device": ([*good, "--device", "abacus"], "device"),
         "config": ([*good, "--config", str(tmp_path / "bad.toml")], "unknown key 'sise' (did you mean 'size'?)"),
         "no config": ([*good, "--config", str(tmp_path / "none.toml")], "config: no such file"),
-        "reference size": ([*good, "--reference", str(tmp_path / "mixed" / "f1.png")], "must be 1 image of 161x120 px"),
+        "reference size": (
+            [*good, "--reference", str(tmp_path / "mixed" / "f1.png")],
+            "reference: expected an image of the input's size 160x120 px, got 161x120 px",
+        ),
         "out is a file": ([*good, "--out", str(tmp_path / "notes.txt")], "notes.txt"),
         "mixed sizes": ([str(tmp_path / "mixed"), *good[1:]], "161 x 120"),
     }

@@ -168,7 +168,8 @@ def test_reweigh_equals_preparing_the_visible_part():
     part = reweigh(prepare(template, illumination="gain"), seen.reshape(1, -1))
     middle = torch.zeros(1, 2)
     alone = prepare(template, mask=seen, illumination="gain", centre=middle)
-    assert rows_agree(part.K[0][:, seen.flatten()], alone.K[0], 1e-3)
+    # (the constant's own row depends on the mean that t is taken off)
+    assert rows_agree(part.K[0][:4, seen.flatten()], alone.K[0][:4], 1e-3)
     assert not part.K[0][:, ~seen.flatten()].any()
     for name in ("slope", "spread", "inflation"):
         a, b = getattr(part, name), getattr(alone, name)

@@ -38,6 +38,16 @@ def test_interpolates_the_pixels(interpolation, size):
     assert torch.allclose(values[0], expected, atol=2e-5)
 
 
+@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+def test_interpolates_the_pixels_at_the_border_too(interpolation):
+    image = noise(1, 1, 21, 27)
+    y, x = torch.meshgrid(torch.arange(21.0) - 10, torch.arange(27.0) - 13, indexing="ij")
+    whole = torch.stack((x.flatten(), y.flatten(), torch.ones(21 * 27)))
+    box = torch.tensor([[-13.0, 13, 13, -13], [-10.0, -10, 10, 10], [1.0, 1, 1, 1]])
+    values = S.make_sampler(interpolation, image, warp_at(13, 10), box)(warp_at(13, 10), whole)
+    assert torch.allclose(values.view(21, 27), image[0, 0], atol=5e-5)
+
+
 @pytest.mark.parametrize(("interpolation", "degree"), [("bilinear", 1), ("bspline3", 3), ("bspline5", 5)])
 def test_reproduces_polynomials(interpolation, degree):
     y, x = torch.meshgrid(torch.arange(120.0), torch.arange(140.0), indexing="ij")

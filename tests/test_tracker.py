@@ -246,3 +246,64 @@ def test_memory_stays_flat_over_a_long_stream():
     for k in range(800):
         tracker(stack[k % 24])
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 3_000  # kB
+
+
+@pytest.mark.parametrize("size", [*range(55, 67), 12, 15])
+def test_masks_of_any_outline(size):
+    stack = frames(PATH)
+    middle = (size - 1) / 2
+    y, x = torch.meshgrid(torch.arange(size) - middle, torch.arange(size) - middle, indexing="ij")
+    center = [(110.0 + (size % 2 == 0) / 2, 95.0 + (size % 2 == 0) / 2)]
+    for mask in (x * x + y * y <= middle**2, x.abs() + y.abs() <= middle, y < x):
+        track = Tracker(stack[0], center, size, mask=mask).track_sequence(stack[1:3])
+        assert (track.status == Status.CONVERGED).all()
+        assert (track.pose - rigid(PATH, center)[1:3])[..., :2].abs().max() < 0.05
+
+
+@pytest.mark.parametrize("pedestal", [0, 3000, 20000, 60000])
+@pytest.mark.parametrize("illumination", ["gain", "linear", "quadratic"])
+def test_a_high_pedestal_changes_nothing(pedestal, illumination):
+    """16-bit cameras with an offset, thermal images in kelvin: little contrast on a lot of light."""
+    stack = SCENE.render(PATH[:3], FRAME)[:, 0] / 2
+    plain = Tracker(stack[0], CENTERS, 61, illumination=illumination)(stack[2])
+    raised = Tracker(stack[0] + pedestal, CENTERS, 61, illumination=illumination)(stack[2] + pedestal)
+    assert (raised.status == Status.CONVERGED).all()
+    assert (raised.pose - plain.pose).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("shape", [(8, 64), (7, 200), (100, 5), (5, 100)])
+def test_frames_of_few_rows_or_columns(shape):
+    frame = 255 * torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    estimate = Tracker(frame, [((shape[1] - 1) / 2, (shape[0] - 1) / 2)], shape)(frame)
+    assert (estimate.displacement.abs() < 1e-3).all()
+
+
+def test_texture_finer_than_the_coarse_levels():
+    frame = 100.0 * ((torch.arange(100)[:, None] + torch.arange(100)) % 2)
+    estimate = Tracker(frame, [(50.0, 50.0)], 41)(frame)
+    assert estimate.status == Status.LOW_TEXTURE  # a spline through such pixels is level at each of them
+    assert torch.equal(estimate.displacement, torch.zeros(1, 3, dtype=torch.float64))
+
+
+def test_casting_a_model_leaves_the_tracker_exact():
+    stack = frames(PATH)
+    model = torch.nn.Sequential(Tracker(stack[0], CENTERS, 51))
+    for cast in (model.half, model.float, model.double):
+        cast()
+        assert model[0].pose.dtype == torch.float64
+        assert (model(stack[1]).status == Status.CONVERGED).all()
+
+
+def test_an_estimate_can_be_changed_without_harm():
+    stack = frames(PATH)
+    tracker = Tracker(stack[0], CENTERS, 51)
+    estimate = tracker(stack[1])
+    estimate.pose.add_(50)
+    assert (tracker(stack[2]).status == Status.CONVERGED).all()
+
+
+def test_a_template_is_found_again_when_partly_outside():
+    stack = frames(poses((110, 95, 0), (96, 81, 0)))
+    estimate = Tracker(stack[0], [(20.0, 20.0)], 41)(stack[1])
+    assert estimate.status == Status.CONVERGED
+    assert (estimate.displacement[0, :2] + 14).abs().max() < 0.02

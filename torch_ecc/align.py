@@ -27,6 +27,8 @@ def align(
     One image serves all templates without copies. ``displacement`` counts from the start pose, which failed elements
     keep. Raises ValueError for bad shapes, dtypes, devices, NaN and unknown options.
     """
+    if not isinstance(reference, Reference):
+        raise ValueError(f"align: reference must come from prepare, got {type(reference).__name__}")
     settings = Settings(interpolation, max_iterations, tolerance)
     gray = as_gray("align", "image", image)
     pose = require_tensor("align", "pose", pose)

@@ -59,19 +59,24 @@ class ECC:
             raise ValueError(f"illumination: expected one of {list(ILLUMINATION)}, got {self.illumination!r}")
 
     def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
-        """[G, t, 1, t u, t v, t u^2, t v^2, t u v], as many as ``illumination`` asks for: (B, 5 + 0 | 2 | 5, N)."""
+        """[G, t, 1, t u, t v, t u^2, t v^2, t u v], as many as ``illumination`` asks for: (B, 5 + 0 | 2 | 5, N).
+
+        t stands without its mean, which the column 1 makes up for: on a high pedestal the two would look alike.
+        """
         u, v = uv[:, :1], uv[:, 1:]
         light = (u, v, u * u, v * v, u * v)[: ILLUMINATION[self.illumination]]
         t = signal[:, 3:]
-        return torch.cat((signal, torch.ones_like(t), *(t * f for f in light)), 1)
+        contrast = t - t.mean(-1, keepdim=True)
+        return torch.cat((signal[:, :3], contrast, torch.ones_like(t), *(t * f for f in light)), 1)
 
     def step(self, reference: Reference, g: Tensor) -> Tensor:
         """b / a, (B, 3); infinite or NaN where the gain a is not positive."""
-        u = (reference.K[:, :4] @ g[:, :, None])[:, :, 0]
+        u = (reference.K[:, :4] @ (g - g.mean(-1, keepdim=True))[:, :, None])[:, :, 0]
         return u[:, :3] / u[:, 3:].clamp(min=0)
 
     def fit(self, reference: Reference, g: Tensor) -> Fit:
         """g minus all columns; the gain is the coefficient a of t."""
+        g = g - g.mean(-1, keepdim=True)
         u = reference.K @ g[:, :, None]
         R = self.columns(reference.signal, reference.uv)
         return Fit(g - (u.mT @ R)[:, 0], u[:, 3, 0])
@@ -94,7 +99,7 @@ class PaperECC:
         """(g - mean g) - (dg / dh) (h - mean h), and dg / dh."""
         h0, dh = centred(reference.signal[:, 3], reference.weight)
         g0, dg = centred(g, reference.weight)
-        gain = dg / dh
+        gain = dg / dh.clamp(min=1e-30)
         return Fit(g0 - gain[:, None] * h0, gain)
 
 
@@ -125,6 +130,8 @@ def centred(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 def make_criterion(criterion: str | Criterion, illumination: str = "linear") -> Criterion:
     """The criterion of a name ("ecc", "ecc_paper" or "ssd"), or the object itself."""
     if not isinstance(criterion, str):
+        if isinstance(criterion, type) or not all(hasattr(criterion, name) for name in ("columns", "step", "fit")):
+            raise ValueError(f"criterion: expected a name or an object with columns, step and fit, got {criterion!r}")
         return criterion
     known: dict[str, Criterion] = {"ecc": ECC(illumination), "ecc_paper": PaperECC(), "ssd": SSD()}
     if criterion not in known:

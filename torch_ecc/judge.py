@@ -14,6 +14,7 @@ from torch_ecc.solver import Settings, State, warps
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
 NOISE_SHARE = 0.8  # of the information in some direction is the template's noise: not even a good match helps
+FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
 
 
@@ -27,7 +28,7 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     residual, gain = reference.criterion.fit(reference, state.patch)
     gain = gain.to(pose.dtype)
     power = (reference.weight * residual * residual).sum(-1) / reference.weight.sum(-1).clamp(min=1e-30)
-    power = power.to(pose.dtype)
+    power, gain = power.to(pose.dtype).nan_to_num(0.0, 0.0, 0.0), gain.nan_to_num(0.0, 0.0, 0.0)
     score = correlation(reference.signal[:, 3], state.patch, reference.weight).to(pose.dtype)
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
     structure = clustering(reference, residual, power)
@@ -78,10 +79,11 @@ def clustering(reference: Reference, residual: Tensor, power: Tensor) -> Tensor:
     together where the gradients are. Their effect summed block by block tells the scatter that they bring (the
     cluster-robust sandwich); 1 where it is not more than the white one's.
     """
-    K = reference.K[:, :3]
-    blocks = int(reference.block[-1]) + 1
+    K, blocks, columns = reference.K[:, :3], len(reference.block_sizes), reference.K.shape[1]
+    if blocks < FEW_BLOCKS * columns:  # too few to tell a scatter from
+        return torch.ones_like(power)[:, None].expand(-1, 3)
     sums = K.new_zeros(len(K), 3, blocks).index_add_(2, reference.block, K * residual[:, None])
-    few = blocks / max(blocks - reference.K.shape[1], 1)  # blocks are not free: the fit has made their sum zero
+    few = blocks / (blocks - columns)  # blocks are not free: the fit has made their sum zero
     white = K.square().sum(-1).to(power.dtype) * power[:, None]
     return (few * sums.square().sum(-1).to(power.dtype) / white.clamp(min=1e-30)).clamp(min=1.0).sqrt()
 

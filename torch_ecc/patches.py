@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import NamedTuple
 
 import torch
@@ -65,9 +66,9 @@ def locate_patches(where: str, frame: Tensor, centers: Centers, size: Size, mask
 def as_size(where: str, size: Size) -> tuple[int, int]:
     """(h, w) of a size given as one number or as (h, w)."""
     pair = tuple(size) if isinstance(size, Sequence) else (size, size)
-    if len(pair) != 2 or any(not isinstance(n, int) or n < SMALLEST for n in pair):
+    if len(pair) != 2 or any(not isinstance(n, Integral) or n < SMALLEST for n in pair):
         raise ValueError(f"{where}: size must be one or two whole numbers of at least {SMALLEST} px, got {size!r}")
-    return pair
+    return int(pair[0]), int(pair[1])
 
 
 def cut(frame: Tensor, patches: Patches, criterion: Criterion) -> Reference:

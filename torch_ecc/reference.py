@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.criteria import Criterion, centred, make_criterion
-from torch_ecc.frame import as_gray, as_mask
+from torch_ecc.frame import as_gray, as_mask, require_tensor
 from torch_ecc.pose import pose_dtype
 from torch_ecc.sampling import blur, gradients, noise_level, pad
 
@@ -37,10 +37,10 @@ class Reference(NamedTuple):
     """B prepared templates of N pixels under a criterion of p columns.
 
     ``pixels`` (3, N) homogeneous pixel positions relative to the middle of the template array; ``box`` (3, 4) the
-    corners of their bounding box; ``block`` (N,) the number of the block of neighbours that a pixel is in; ``centre``
-    (B, 2) the point x' = 0 in the pixels' coordinates; ``radius`` (B,) px from there to the farthest pixel; ``noise``
-    (B,) upper estimate of the template's noise, grey levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and
-    blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
+    corners of their bounding box; ``block`` (N,) the number of the block of neighbours that a pixel is in and
+    ``block_sizes`` (blocks,) how many there are in each; ``centre`` (B, 2) the point x' = 0 in the pixels' coordinates;
+    ``radius`` (B,) px from there to the farthest pixel; ``noise`` (B,) upper estimate of the template's noise, grey
+    levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
 
     For the covariance, each (B, 3, 3): ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other columns,
     and ``inflation``, what white noise of unit variance in the template adds to ``slope``; ``noise_share`` (B,) is the
@@ -51,6 +51,7 @@ class Reference(NamedTuple):
     pixels: Tensor
     box: Tensor
     block: Tensor
+    block_sizes: Tensor
     centre: Tensor
     radius: Tensor
     noise: Tensor
@@ -79,7 +80,9 @@ class Reference(NamedTuple):
         """The reference of the templates at ``index`` (n,)."""
         if len(index) == len(self.K):
             return self
-        shared = {"criterion", "pixels", "box", "block"} | ({"weight"} if len(self.weight) == 1 else set())
+        shared = {"criterion", "pixels", "box", "block", "block_sizes"} | (
+            {"weight"} if len(self.weight) == 1 else set()
+        )
         return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
@@ -112,7 +115,9 @@ def prepare(
     wide = pad(gray, MARGIN)
     inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
     sharp, soft = (torch.cat((gradients(image), image), 1)[inner] for image in (wide, blur(wide, INSTRUMENT_BLUR)))
-    centre = gray.new_zeros(len(gray), 2) if centre is None else centre.to(gray).expand(len(gray), 2)
+    centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre).to(gray)
+    if centre.shape != (len(gray), 2):
+        raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
     return _assemble(chosen, sharp, soft, kept, centre)
 
 
@@ -141,8 +146,8 @@ def _assemble(criterion: Criterion, sharp: Tensor, soft: Tensor, kept: Tensor, c
     noise = torch.maximum(noise_level(sharp[:, 2:], kept), LEAST_NOISE * contrast)
     nothing = radius.new_zeros(len(sharp), 3, 3)
     column, row = ((pixels[:2] - box[:2, :1]) / BLOCK).long()
-    block = row * (int(column.max()) + 1) + column
-    constants = (pixels, box, block, centre, radius, noise, signal, instrument, weight)
+    _, block, block_sizes = torch.unique(row * w + column, return_inverse=True, return_counts=True)
+    constants = (pixels, box, block, block_sizes, centre, radius, noise, signal, instrument, weight)
     return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing, radius), weight > 0)
 
 

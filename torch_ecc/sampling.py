@@ -68,7 +68,8 @@ class BSpline(NamedTuple):
         values = torch.zeros_like(points[:, 0])
         for wx, x in pairs:
             for wy, y in pairs:
-                look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), 1))
+                # The coefficients mirror at the border, as the prefilter has assumed.
+                look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), 1), "reflection")
                 values.addcmul_(look, wx[:, 0] * wy[:, 1])
         return values
 
@@ -129,11 +130,11 @@ def _unit_square(h: int, w: int, dtype: torch.dtype, device: torch.device) -> tu
     return torch.tensor([[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]], dtype=dtype, device=device), -1.0
 
 
-def _lookup(image: Tensor, points: Tensor) -> Tensor:
+def _lookup(image: Tensor, points: Tensor, beyond: str = "border") -> Tensor:
     """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, 2, N): (B, N)."""
     grid = points.movedim(1, -1)[:, None]
     image = image.expand(len(points), -1, -1, -1)
-    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[:, 0, 0]
+    return F.grid_sample(image, grid, mode="bilinear", padding_mode=beyond, align_corners=True)[:, 0, 0]
 
 
 def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:

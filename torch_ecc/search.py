@@ -13,6 +13,7 @@ from torch_ecc.reference import Reference
 from torch_ecc.sampling import Bilinear, inside
 from torch_ecc.solver import warps
 
+LEAST_SEEN = 0.25  # of a template's weight must lie in the frame
 TURNS_DEG = (0.0, -8.0, 8.0, -16.0, 16.0, -24.0, 24.0)
 
 
@@ -33,7 +34,7 @@ def best_shift(reference: Reference, image: Tensor, pose: Tensor) -> tuple[Tenso
     """The whole-pixel shift of ``pose`` (B, 3) along the template's axes with the best correlation, and that, (B,).
 
     Zero-mean normalised correlation under the template's weights, for all shifts at once, as correlations of images.
-    Places where the template would leave the frame do not count.
+    What would leave the frame does not count.
     """
     (left, top), (right, bottom) = reference.box[:2, 0].tolist(), reference.box[:2, 2].tolist()
     reach, (h, w) = int(reference.radius.amax()), (int(bottom - top) + 1, int(right - left) + 1)
@@ -51,23 +52,30 @@ def best_shift(reference: Reference, image: Tensor, pose: Tensor) -> tuple[Tenso
 
 
 def _as_images(reference: Reference, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Template with zero weighted mean and unit norm, and the weights summing to one, as kernels (B, 1, h, w)."""
+    """Template less its weighted mean, and the weights summing to one, as images (B, 1, h, w)."""
     t = reference.signal[:, 3]
     weight = (reference.weight / reference.weight.sum(-1, keepdim=True)).expand_as(t)
-    t = weight * (t - (weight * t).sum(-1, keepdim=True))
-    t = t / (t * t / weight.clamp(min=1e-30)).sum(-1, keepdim=True).sqrt()
+    t = t - (weight * t).sum(-1, keepdim=True)
     column, row = (reference.pixels[:2] - reference.box[:2, :1]).round().long()
-    kernels = t.new_zeros(2, len(t), 1, *size)
-    kernels[:, :, 0, row, column] = torch.stack((t, weight))
-    return kernels[0], kernels[1]
+    images = t.new_zeros(2, len(t), 1, *size)
+    images[:, :, 0, row, column] = torch.stack((t, weight))
+    return images[0], images[1]
 
 
 def _scores(window: Tensor, framed: Tensor, t: Tensor, weight: Tensor) -> Tensor:
-    """Normalised correlation (1, B, shifts, shifts) of templates with their windows (1, B, H, W); -1 off the frame."""
+    """Normalised correlation (1, B, shifts, shifts) of templates with their windows (1, B, H, W), of what lies in the
+    frame; -1 where that is too little."""
 
     def correlate(image: Tensor, kernel: Tensor) -> Tensor:
         return F.conv2d(image, kernel, groups=len(kernel))
 
-    variance = correlate(window * window, weight) - correlate(window, weight) ** 2
-    score = correlate(window, t) / variance.clamp(min=1e-6 * float(window.var())).sqrt()
-    return torch.where(correlate(framed, weight) > 0.999, score, -1.0)
+    window = window * framed
+    seen, tw = correlate(framed, weight), weight * t
+    share = seen.clamp(min=1e-6)
+    g, h = correlate(window, weight), correlate(framed, tw)
+    product = correlate(window, tw) - g * h / share
+    power = correlate(window * window, weight) - g * g / share
+    own = correlate(framed, tw * t) - h * h / share
+    floor = 1e-6 * own.amax((2, 3), keepdim=True)
+    score = product / (power.clamp(min=floor) * own.clamp(min=floor)).sqrt()
+    return torch.where(seen >= LEAST_SEEN, score, -1.0)

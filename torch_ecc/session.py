@@ -108,6 +108,11 @@ class Session:
         options = {name: getattr(job, name) for name in names.split()}
         centers, size, mask = self.templates
         self.tracker = Tracker(first, centers, size, mask=mask, **options)
+        if self.source.shape != first.shape[-2:]:
+            (h, w), (h0, w0) = self.source.shape, first.shape[-2:]
+            raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
+        if job.fps is not None and not (math.isfinite(job.fps) and job.fps > 0):
+            raise ValueError(f"fps: expected a rate > 0 in Hz, got {job.fps:g}")
         self.fps = job.fps if job.fps is not None else self.source.fps
 
     def run(self, progress: Callable[[Estimate], None] = lambda estimate: None) -> Outcome:
@@ -123,8 +128,11 @@ class Session:
         writer, overlay = self._writers(folder)
         try:
             with writer, overlay:
-                for frame in self.frames:
-                    estimate = self.tracker(frame)
+                for number, frame in enumerate(self.frames):
+                    try:
+                        estimate = self.tracker(frame)
+                    except ValueError as error:
+                        raise ValueError(f"frame {number}: {error}") from error
                     writer.write(estimate)
                     overlay.write(frame, estimate)
                     last = estimate.status.cpu().long()

@@ -37,8 +37,8 @@ class Settings:
         known = ["bilinear", "bspline3", "bspline5"]
         if self.interpolation not in known:
             raise ValueError(f"interpolation: expected one of {known}, got {self.interpolation!r}")
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations: expected at least 1, got {self.max_iterations}")
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
+            raise ValueError(f"max_iterations: expected a whole number of at least 1, got {self.max_iterations}")
         if not self.tolerance > 0:
             raise ValueError(f"tolerance: expected a length in px > 0, got {self.tolerance}")
         for name, value in (("min_score", self.min_score), ("min_visible", self.min_visible)):

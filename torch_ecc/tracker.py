@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Self
 
@@ -20,8 +21,10 @@ from torch_ecc.search import best_match
 from torch_ecc.solver import Settings, State, stage
 
 PREDICTIONS = ("hold", "velocity")
-SEARCH_LEVELS = 3  # pyramid levels of the second attempt for a template that was not found where it was expected
 SMALLEST_COARSE = 12  # px: a template is not halved below this side
+SEARCHED = (
+    40  # px: for the search a template is halved until its smaller side is at most this; its cost grows as side^4
+)
 COARSE_TOLERANCE = 0.1  # px of a coarse level
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
 MEMORY = 0.05  # weight of the newest frame in the usual score
@@ -83,7 +86,10 @@ class Tracker(nn.Module):
         with torch.no_grad():
             patches = locate_patches("Tracker", gray, centers, size, mask)
             _check_levels(levels, patches.size)
-            self.references = pyramid(gray, patches, chosen, max(levels, SEARCH_LEVELS))
+            wanted = max(levels, search_levels(patches.size)) if search else levels
+            self.references = pyramid(gray, patches, chosen, wanted)
+        if len(self.references) < levels:
+            raise ValueError(f"levels: expected at most {len(self.references)} for these templates, got {levels}")
         self.levels = levels
         start = torch.cat((patches.centers, torch.zeros_like(patches.centers[:, :1])), 1)
         self.register_buffer("start", start)
@@ -93,8 +99,10 @@ class Tracker(nn.Module):
         self.register_buffer("tracked", torch.ones_like(start[:, 0], dtype=torch.bool))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        self.references = [reference.map(fn) for reference in self.references]
+        # Only the device may change: poses stay float64 and pixels float32 whatever the rest of a model is cast to.
+        device = fn(self.score).device
+        super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
+        self.references = [reference.map(lambda tensor: tensor.to(device)) for reference in self.references]
         return self
 
     @torch.no_grad()
@@ -108,7 +116,8 @@ class Tracker(nn.Module):
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(gray.shape)}")
         images = [gray]
         estimate = self._solve(images, compose(self.pose, self.velocity), self.levels)
-        lost = (~Status.good(estimate.status)).nonzero()[:, 0]
+        missing = (estimate.status == Status.LOST) | (estimate.status == Status.OUT_OF_VIEW)
+        lost = missing.nonzero()[:, 0]
         if len(lost) and self.search:
             estimate = self._search(images, estimate, lost)
         return self._advance(estimate)
@@ -170,18 +179,26 @@ class Tracker(nn.Module):
             self.velocity = torch.where(good & self.tracked[:, None], compose(inverse(self.pose), pose), 0.0)
         self.pose, self.tracked = pose, good[:, 0]
         self.score = torch.where(self.tracked, torch.lerp(self.score, estimate.score, MEMORY), self.score)
-        return estimate._replace(pose=pose, displacement=pose - self.start)
+        return estimate._replace(pose=pose.clone(), displacement=pose - self.start)
 
 
 def pyramid(frame: Tensor, patches: Patches, criterion: Criterion, levels: int) -> list[Reference]:
     """References of the templates at up to ``levels`` levels, while they keep texture enough; level l has 2^-l px."""
     references = [cut(frame, patches, criterion)]
-    while len(references) < levels:
+    while len(references) < levels and min(patches.size) // 2 >= SMALLEST_COARSE:
         frame, patches = halve(frame), halve_patches(patches)
         if int((patches.mask > 0).sum((1, 2, 3)).min()) < SMALLEST_COARSE**2 // 2:
             break
-        references.append(cut(frame, patches, criterion))
+        try:
+            references.append(cut(frame, patches, criterion))
+        except ValueError:  # texture finer than this level: one single grey level is left
+            break
     return references
+
+
+def search_levels(size: tuple[int, int]) -> int:
+    """Levels after which the smaller side of a template (h, w) is at most SEARCHED px, three at least."""
+    return max(3, math.ceil(math.log2(min(size) / SEARCHED)) + 1)
 
 
 def expected_score(reference: Reference) -> Tensor:
@@ -193,7 +210,7 @@ def expected_score(reference: Reference) -> Tensor:
 
 def _check_levels(levels: int, size: tuple[int, int]) -> None:
     most = max((min(size) // SMALLEST_COARSE).bit_length(), 1)
-    if not 1 <= levels <= most:
+    if not isinstance(levels, int) or not 1 <= levels <= most:
         raise ValueError(f"levels: expected 1 to {most} for templates of {size[1]}x{size[0]} px, got {levels}")
 
 
