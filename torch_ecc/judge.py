@@ -31,7 +31,7 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     power, gain = power.to(pose.dtype).nan_to_num(0.0, 0.0, 0.0), gain.nan_to_num(0.0, 0.0, 0.0)
     score = correlation(reference.signal[:, 3], state.patch, reference.weight).to(pose.dtype)
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
-    structure = clustering(reference, residual, power)
+    structure = clustering(reference, residual, noise * (1 + gain * gain))
     covariance, fixed = pose_covariance(reference, noise, gain, pose, structure)
     shown = visible >= settings.min_visible
     match = (score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
@@ -73,7 +73,7 @@ def noise_variance(reference: Reference, power: Tensor, gain: Tensor, sampled: f
 
 
 def clustering(reference: Reference, residual: Tensor, power: Tensor) -> Tensor:
-    """How much more the increment scatters, (B, 3), than with a white residual (B, N) of mean square ``power`` (B,).
+    """How much more the increment scatters, (B, 3), with ``residual`` (B, N) than with white noise of ``power`` (B,).
 
     What no noise model knows (edges that the sampler rounds, light, an occluder, blur) leaves residuals that cling
     together where the gradients are. Their effect summed block by block tells the scatter that they bring (the
