@@ -1,0 +1,102 @@
+"""The method that the paper compares with, its ref. 34: SSD whose Jacobian and Hessian are made anew at every frame.
+
+Inverse additive (Hager and Belhumeur, IEEE TPAMI 20(10), 1998). With dI/dx = grad h R^T at the solution, the Jacobian
+of the sampled patch by the pose is
+
+    J(theta) = grad h R(theta)^T [ I | dR/dtheta x' ] = [ grad h R(theta)^T | grad h (y', -x') ],
+
+taken at the theta where a frame starts and kept during that frame's iterations p <- p - (J^T J)^-1 J^T (g - h).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_ecc.pose import rotation
+from torch_ecc.reference import MARGIN
+from torch_ecc.sampling import Sampler, gradients, make_sampler
+from torch_ecc.solver import COARSE_TOLERANCE
+
+
+def jacobian(templates: Tensor, theta: Tensor) -> Tensor:
+    """J(theta) (R, N, 3) of templates (R, 1, h + 2 MARGIN, w + 2 MARGIN) at angles (R,), eqs. (7), (8)."""
+    inner = slice(MARGIN, -MARGIN)
+    gradient = gradients(templates)[:, :, inner, inner]
+    x, y, _ = pixels((gradient.shape[-2], gradient.shape[-1]))
+    across = gradient.flatten(2).mT  # grad h, (R, N, 2)
+    turned = across @ rotation(theta).mT.to(across.dtype)
+    return torch.cat((turned, (across[..., 0] * y - across[..., 1] * x)[..., None]), -1)
+
+
+def pixels(size: tuple[int, int]) -> Tensor:
+    """Homogeneous pixel positions (3, N) about the middle of a template (h, w)."""
+    y, x = torch.meshgrid(*(torch.arange(n) - (n - 1) / 2 for n in size), indexing="ij")
+    return torch.stack((x.flatten(), y.flatten(), torch.ones(x.numel())))
+
+
+class Ref34:
+    """R templates of h x w px, each with ``MARGIN`` px around it, from their poses (R, 3) on: ``track`` every frame.
+
+    The samplers, the bilinear iterations first and the stop rule are those of the tracker.
+    """
+
+    def __init__(
+        self,
+        templates: Tensor,
+        pose: Tensor,
+        *,
+        interpolation: str = "bspline3",
+        max_iterations: int = 15,
+        tolerance: float = 1e-3,
+    ) -> None:
+        self.templates, self.pose, self.interpolation = templates.float(), pose.clone(), interpolation
+        self.max_iterations, self.tolerance = max_iterations, tolerance
+        h, w = (n - 2 * MARGIN for n in templates.shape[-2:])
+        self.h = self.templates[:, 0, MARGIN:-MARGIN, MARGIN:-MARGIN].flatten(1)
+        self.pixels = pixels((h, w))
+        self.box = self.pixels[:, [0, w - 1, h * w - 1, (h - 1) * w]]
+        radius = float(self.box[:2, 0].norm())
+        self.lever = pose.new_tensor((1.0, 1.0, radius))
+
+    def precompute(self) -> Tensor:
+        """What this method does before each frame: gradient, J(theta) and (J^T J)^-1 J^T, (R, 3, N)."""
+        J = jacobian(self.templates, self.pose[:, 2])
+        hessian = (J.mT @ J).double()
+        return (torch.linalg.inv(hessian) @ J.mT.double()).to(J.dtype)
+
+    def sampler(self, image: Tensor, interpolation: str) -> Sampler:
+        """The sampler of frames (1 or R, 1, H, W), float32, around the present poses."""
+        return make_sampler(interpolation, image, self.warp(), self.box)
+
+    def warp(self) -> Tensor:
+        """2x3 warps (R, 2, 3) of the present poses."""
+        return torch.cat((rotation(self.pose[:, 2]), self.pose[:, :2, None]), -1)
+
+    def iterate(self, sample: Sampler, solve: Tensor) -> Tensor:
+        """One step with the constants ``solve`` of this frame; its length (R,) in px at the farthest pixel."""
+        error = sample(self.warp(), self.pixels) - self.h
+        delta = (solve @ error[:, :, None])[:, :, 0].to(self.pose.dtype)
+        self.pose = self.pose - delta
+        return (delta * self.lever).norm(dim=-1)
+
+    def track(self, frame: Tensor) -> Tensor:
+        """Poses (R, 3) px, px, rad in the next frame (1 or R, 1, H, W)."""
+        image, solve = frame.float(), self.precompute()
+        budget = self.max_iterations
+        if self.interpolation != "bilinear" and budget > 1:
+            coarse = budget * 2 // 3
+            self._stage(self.sampler(image, "bilinear"), solve, max(self.tolerance, COARSE_TOLERANCE), coarse)
+            budget -= coarse
+        self._stage(self.sampler(image, self.interpolation), solve, self.tolerance, budget)
+        return self.pose
+
+    def _stage(self, sample: Sampler, solve: Tensor, tolerance: float, budget: int) -> None:
+        """Steps until what their shrinking series still lacks is below ``tolerance`` px for every template."""
+        last = torch.full_like(self.pose[:, 0], torch.inf)
+        for _ in range(budget):
+            length = self.iterate(sample, solve)
+            rate = torch.where(last.isfinite(), length / last, 0.5).clamp(0.05, 0.95)
+            if not bool((length * rate / (1 - rate) > tolerance).any()):
+                break
+            last = length
