@@ -59,7 +59,7 @@ class Estimate(NamedTuple):
     @property
     def sigma(self) -> Tensor:
         """Standard deviations of the pose: (R, 3) px, px, rad."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
 
 
 class Track(Estimate):

@@ -94,13 +94,17 @@ def pose_covariance(
     """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of variance ``noise`` (B,), the patch
     ``gain`` (B,) times the template's contrast; and whether the texture fixes the pose, (B,) bool.
 
-    Sandwich of the instrumental-variable estimate: (1 + 1 / gain^2) v S^-1 (Z~ Z~^T) S^-T, turned from the template's
-    axes to the frame's. S is freed of the template noise in it. ``structure`` (B, 3): see ``clustering``.
+    Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T, turned from the
+    template's axes to the frame's. The template's noise is taken out of S, and out of P for its own part P_t: a
+    derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``structure`` (B, 3): see
+    ``clustering``.
     """
     own = torch.minimum(noise, reference.noise.to(noise.dtype) ** 2)
     inverse, regular = safe_inverse(reference.slope - own[:, None, None] * reference.inflation)
     textured = own * reference.noise_share < NOISE_SHARE
-    local = inverse @ reference.spread @ inverse.mT * (noise * (1 + 1 / (gain * gain).clamp(min=1e-12)))[:, None, None]
+    frame = (1 / (gain * gain).clamp(min=1e-12))[:, None, None]
+    spread = (1 + frame) * reference.spread - own[:, None, None] * reference.spread_noise
+    local = inverse @ spread @ inverse.mT * noise[:, None, None]
     if structure is not None:
         local = local * structure[:, :, None] * structure[:, None, :]
     turn = torch.eye(3, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)

@@ -43,8 +43,8 @@ class Reference(NamedTuple):
     levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
 
     For the covariance, each (B, 3, 3): ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other columns,
-    and ``inflation``, what white noise of unit variance in the template adds to ``slope``; ``noise_share`` (B,) is the
-    largest part of ``slope`` that such noise can be, in any direction.
+    ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each; ``noise_share``
+    (B,) is the largest part of ``slope`` that such noise can be, in any direction.
     """
 
     criterion: Criterion
@@ -62,6 +62,7 @@ class Reference(NamedTuple):
     slope: Tensor
     spread: Tensor
     inflation: Tensor
+    spread_noise: Tensor
     noise_share: Tensor
 
     @property
@@ -148,7 +149,7 @@ def _assemble(criterion: Criterion, sharp: Tensor, soft: Tensor, kept: Tensor, c
     column, row = ((pixels[:2] - box[:2, :1]) / BLOCK).long()
     _, block, block_sizes = torch.unique(row * w + column, return_inverse=True, return_counts=True)
     constants = (pixels, box, block, block_sizes, centre, radius, noise, signal, instrument, weight)
-    return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing, radius), weight > 0)
+    return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing, nothing, radius), weight > 0)
 
 
 def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:
@@ -170,13 +171,14 @@ def reweigh(reference: Reference, seen: Tensor) -> Reference:
     project = torch.eye(3, dtype=dtype, device=weight.device).expand(len(R), 3, 3)
     project = torch.cat((project, -normal[:, :3, 3:] @ others), -1)
     slope = (project @ normal)[:, :, :3] * regular[:, None, None]
-    inflation = _noise_slope(reference, weight) * noise_response()
+    inflation = _noise_slope(reference, weight) * noise_response()[0]
     return reference._replace(
         weight=weight,
         K=(inverse @ ZW.to(dtype)).to(R.dtype),
         slope=slope,
         spread=project @ power @ project.mT,
         inflation=inflation,
+        spread_noise=_noise_slope(reference, weight * weight) * noise_response()[1],
         noise_share=_largest_share(slope, inflation),
     )
 
@@ -217,8 +219,9 @@ def _noise_slope(reference: Reference, weight: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=1)
-def noise_response() -> float:
-    """Mean product of the raw and the blurred x derivative of white noise of unit variance."""
+def noise_response() -> tuple[float, float]:
+    """Of the x derivative of white noise of unit variance: raw times blurred, and blurred squared, on average."""
     impulse = torch.zeros(1, 1, 33, 33)
     impulse[..., 16, 16] = 1.0
-    return float((gradients(impulse)[:, 0] * gradients(blur(impulse, INSTRUMENT_BLUR))[:, 0]).sum())
+    raw, blurred = gradients(impulse)[:, 0], gradients(blur(impulse, INSTRUMENT_BLUR))[:, 0]
+    return float((raw * blurred).sum()), float((blurred * blurred).sum())
