@@ -63,7 +63,8 @@ class Ref34:
         """What this method does before each frame: gradient, J(theta) and (J^T J)^-1 J^T, (R, 3, N)."""
         J = jacobian(self.templates, self.pose[:, 2])
         hessian = (J.mT @ J).double()
-        return (torch.linalg.inv(hessian) @ J.mT.double()).to(J.dtype)
+        solve: Tensor = torch.linalg.inv(hessian) @ J.mT.double()
+        return solve.to(J.dtype)
 
     def sampler(self, image: Tensor, interpolation: str) -> Sampler:
         """The sampler of frames (1 or R, 1, H, W), float32, around the present poses."""
@@ -78,7 +79,8 @@ class Ref34:
         error = sample(self.warp(), self.pixels) - self.h
         delta = (solve @ error[:, :, None])[:, :, 0].to(self.pose.dtype)
         self.pose = self.pose - delta
-        return (delta * self.lever).norm(dim=-1)
+        length: Tensor = torch.linalg.vector_norm(delta * self.lever, dim=-1)
+        return length
 
     def track(self, frame: Tensor) -> Tensor:
         """Poses (R, 3) px, px, rad in the next frame (1 or R, 1, H, W)."""
