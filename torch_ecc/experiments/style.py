@@ -1,0 +1,42 @@
+"""How the pictures look."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from typing import Any, cast
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+RC: dict[str, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.2,
+}
+COMPONENTS = ("x", "y", r"$\theta$")
+UNITS = ("px", "px", "deg")
+
+
+def styled() -> AbstractContextManager[None]:
+    """The context in which a figure is drawn."""
+    return cast("AbstractContextManager[None]", mpl.rc_context(RC))
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure in inches that lays itself out."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def letter(axes: Axes, text: str) -> None:
+    """A bold panel letter with words behind it, top left, as in the paper's figures: "(a) ..."."""
+    label, _, words = text.partition(" ")
+    axes.set_title(rf"$\bf{{{label}}}$ {words}", loc="left")
