@@ -8,12 +8,12 @@ from torch import Tensor
 from torch_ecc.criteria import centred
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.pose import rotation
-from torch_ecc.reference import Reference, reweigh, safe_inverse
+from torch_ecc.reference import ALIASING, Reference, reweigh, safe_inverse
 from torch_ecc.sampling import NOISE_GAIN, inside
 from torch_ecc.solver import Settings, State, warps
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
-NOISE_SHARE = 0.8  # of the information in some direction is the template's noise: not even a good match helps
+NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
 
@@ -32,7 +32,8 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     score = correlation(reference.signal[:, 3], state.patch, reference.weight).to(pose.dtype)
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
     structure = clustering(reference, residual, noise * (1 + gain * gain))
-    covariance, fixed = pose_covariance(reference, noise, gain, pose, structure)
+    sampler = interpolation_error(reference, pose, settings.interpolation)
+    covariance, fixed = pose_covariance(reference, noise, gain, pose, structure, sampler)
     shown = visible >= settings.min_visible
     match = (score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
     status = decide(whole, shown, match, fixed, state.error <= settings.tolerance)
@@ -88,8 +89,33 @@ def clustering(reference: Reference, residual: Tensor, power: Tensor) -> Tensor:
     return (few * sums.square().sum(-1).to(power.dtype) / white.clamp(min=1e-30)).clamp(min=1.0).sqrt()
 
 
+def interpolation_error(reference: Reference, pose: Tensor, interpolation: str) -> Tensor:
+    """Covariance (B, 3, 3), in the template's axes, of what aliasing in the sampler shifts poses (B, 3) by.
+
+    Where all pixels lie alike between the frame's (no rotation) their errors add up; over a turned template they
+    cancel. The shift is ``Reference.alias`` times the sine of the phase, whose mean square is one half.
+    """
+    if interpolation not in ALIASING:
+        return pose.new_zeros(len(pose), 3, 3)
+    shift = reference.alias[:, ALIASING.index(interpolation)]
+    width, height = (reference.box[:2, 2] - reference.box[:2, 0] + 1).to(pose.dtype)
+    alike = _alike(pose[:, 2].cos(), width) * _alike(pose[:, 2].sin(), height)
+    return shift @ shift.mT * (alike.square() / 2)[:, None, None]
+
+
+def _alike(step: Tensor, count: Tensor) -> Tensor:
+    """Mean of exp(2 pi i k step) over ``count`` neighbours k, but for its phase: 1 for whole steps (Dirichlet)."""
+    step = step - step.round()
+    return torch.sinc(count * step) / torch.sinc(step)
+
+
 def pose_covariance(
-    reference: Reference, noise: Tensor, gain: Tensor, pose: Tensor, structure: Tensor | None = None
+    reference: Reference,
+    noise: Tensor,
+    gain: Tensor,
+    pose: Tensor,
+    structure: Tensor | None = None,
+    sampler: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of variance ``noise`` (B,), the patch
     ``gain`` (B,) times the template's contrast; and whether the texture fixes the pose, (B,) bool.
@@ -97,7 +123,7 @@ def pose_covariance(
     Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T, turned from the
     template's axes to the frame's. The template's noise is taken out of S, and out of P for its own part P_t: a
     derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``structure`` (B, 3): see
-    ``clustering``.
+    ``clustering``; ``sampler`` (B, 3, 3): see ``interpolation_error``.
     """
     own = torch.minimum(noise, reference.noise.to(noise.dtype) ** 2)
     inverse, regular = safe_inverse(reference.slope - own[:, None, None] * reference.inflation)
@@ -107,6 +133,8 @@ def pose_covariance(
     local = inverse @ spread @ inverse.mT * noise[:, None, None]
     if structure is not None:
         local = local * structure[:, :, None] * structure[:, None, :]
+    if sampler is not None:
+        local = local + sampler
     turn = torch.eye(3, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)
     turn[:, :2, :2] = rotation(pose[:, 2])
     covariance = turn @ local @ turn.mT

@@ -5,7 +5,8 @@ The columns R of a criterion become one matrix by the oblique (instrumental-vari
     K = (Z W R^T)^-1 Z W,        W the weights, Z the same columns made from the slightly blurred template.
 
 The noise of a template is in its own gradients too. With Z = R (least squares) that inflates the Hessian and shortens
-every step; blurred gradients are nearly independent of that noise and keep the step at its right length.
+every step; blurred gradients are nearly independent of that noise and keep the step at its right length. Where the
+gradients are noise alone they are left out of Z.
 
 In an inverse compositional scheme the increment is always taken at the identity of the template's own coordinates, so
 G at theta = 0 and with it K are exact for every theta of the target. (The paper calls the constant Hessian an
@@ -24,9 +25,12 @@ from torch import Tensor
 from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.frame import as_gray, as_mask, require_tensor
 from torch_ecc.pose import pose_dtype
-from torch_ecc.sampling import blur, gradients, noise_level, pad
+from torch_ecc.sampling import aliasing, blur, gradients, noise_level, pad
 
-INSTRUMENT_BLUR = 0.8  # px; 0.7 to 1 serve alike
+INSTRUMENT_BLUR = 0.9  # px; 0.7 to 1 serve alike
+NEARBY = 4.0  # px: Gaussian window in which the texture of a template is told from its noise
+CERTAIN = 1.3  # times the noise's power in that window: by chance alone it is not more
+ALIASING = ("bilinear", "bspline3")  # samplers whose own error counts; that of bspline5 does not
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
 LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
 BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
@@ -40,11 +44,13 @@ class Reference(NamedTuple):
     corners of their bounding box; ``block`` (N,) the number of the block of neighbours that a pixel is in and
     ``block_sizes`` (blocks,) how many there are in each; ``centre`` (B, 2) the point x' = 0 in the pixels' coordinates;
     ``radius`` (B,) px from there to the farthest pixel; ``noise`` (B,) upper estimate of the template's noise, grey
-    levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and blurred; ``weight`` (1 or B, N); ``K`` (B, p, N).
+    levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and blurred, the blurred G times ``trust`` (B, N), see
+    ``texture_share``; ``weight`` (1 or B, N); ``K`` (B, p, N).
 
-    For the covariance, each (B, 3, 3): ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other columns,
-    ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each; ``noise_share``
-    (B,) is the largest part of ``slope`` that such noise can be, in any direction.
+    For the covariance: ``alias`` (B, 2, 3, 2), how far aliasing along the template's x and y shifts the pose at most,
+    with the samplers ``ALIASING``; each (B, 3, 3) ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other
+    columns, ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each;
+    ``noise_share`` (B,) is the largest part of ``slope`` that such noise can be, in any direction.
     """
 
     criterion: Criterion
@@ -57,7 +63,9 @@ class Reference(NamedTuple):
     noise: Tensor
     signal: Tensor
     instrument: Tensor
+    trust: Tensor
     weight: Tensor
+    alias: Tensor
     K: Tensor
     slope: Tensor
     spread: Tensor
@@ -119,7 +127,11 @@ def prepare(
     centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre).to(gray)
     if centre.shape != (len(gray), 2):
         raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
-    return _assemble(chosen, sharp, soft, kept, centre)
+    reference = _assemble(chosen, sharp, soft, kept, centre)
+    wrong = torch.stack([aliasing(wide, name)[inner] for name in ALIASING], 1).flatten(3)[
+        ..., (kept > 0).any(0).flatten()
+    ]
+    return reference._replace(alias=(reference.K[:, None, :3] @ wrong.mT).to(reference.radius.dtype))
 
 
 def _refuse_flat(gray: Tensor, kept: Tensor) -> None:
@@ -145,10 +157,12 @@ def _assemble(criterion: Criterion, sharp: Tensor, soft: Tensor, kept: Tensor, c
     radius = (local.norm(dim=1) * (weight > 0)).amax(-1).to(pose_dtype(sharp.device))
     contrast = centred(signal[:, 3], weight)[1] / weight.sum(-1).sqrt()
     noise = torch.maximum(noise_level(sharp[:, 2:], kept), LEAST_NOISE * contrast)
-    nothing = radius.new_zeros(len(sharp), 3, 3)
+    trust = texture_share(soft[:, :2], noise).flatten(1)[:, used]
+    instrument = torch.cat((instrument[:, :3] * trust[:, None], instrument[:, 3:]), 1)
+    nothing, no_alias = radius.new_zeros(len(sharp), 3, 3), radius.new_zeros(len(sharp), len(ALIASING), 3, 2)
     column, row = ((pixels[:2] - box[:2, :1]) / BLOCK).long()
     _, block, block_sizes = torch.unique(row * w + column, return_inverse=True, return_counts=True)
-    constants = (pixels, box, block, block_sizes, centre, radius, noise, signal, instrument, weight)
+    constants = (pixels, box, block, block_sizes, centre, radius, noise, signal, instrument, trust, weight, no_alias)
     return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing, nothing, radius), weight > 0)
 
 
@@ -156,6 +170,17 @@ def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:
     """[G, t] (B, 4, N) from [d/dx, d/dy, t] (B, 3, N): eq. (8) at theta = 0 gives dW/dtheta = (y', -x')."""
     gx, gy, t = image.unbind(1)
     return torch.stack((gx, gy, gx * local[:, 1] - gy * local[:, 0], t), 1)
+
+
+def texture_share(gradient: Tensor, noise: Tensor) -> Tensor:
+    """How much of the blurred ``gradient`` (B, 2, h, w) is texture, not ``noise`` (B,), near each pixel: (B, 1, h, w).
+
+    The factor S / (S + N / 2) that makes the scatter of two equally noisy images least, from the gradient's power
+    nearby. Where a template is flat its gradient is all noise, which as an instrument would only add scatter.
+    """
+    floor = 2 * noise_response()[1] * noise.to(gradient.dtype).square()[:, None, None, None]
+    power = (blur(gradient.square().sum(1, keepdim=True), NEARBY) - CERTAIN * floor).clamp(min=0)
+    return power / (power + floor / 2).clamp(min=1e-30)
 
 
 def reweigh(reference: Reference, seen: Tensor) -> Reference:
@@ -171,14 +196,14 @@ def reweigh(reference: Reference, seen: Tensor) -> Reference:
     project = torch.eye(3, dtype=dtype, device=weight.device).expand(len(R), 3, 3)
     project = torch.cat((project, -normal[:, :3, 3:] @ others), -1)
     slope = (project @ normal)[:, :, :3] * regular[:, None, None]
-    inflation = _noise_slope(reference, weight) * noise_response()[0]
+    inflation = _noise_slope(reference, weight * reference.trust) * noise_response()[0]
     return reference._replace(
         weight=weight,
         K=(inverse @ ZW.to(dtype)).to(R.dtype),
         slope=slope,
         spread=project @ power @ project.mT,
         inflation=inflation,
-        spread_noise=_noise_slope(reference, weight * weight) * noise_response()[1],
+        spread_noise=_noise_slope(reference, (weight * reference.trust).square()) * noise_response()[1],
         noise_share=_largest_share(slope, inflation),
     )
 

@@ -141,6 +141,8 @@ def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
     """Pairs of neighbouring taps around a point with fractional part ``f``, any shape: the first one's offset, the
     sum of both weights and the second one's weight."""
     r = 1 - f
+    if degree == 1:
+        return [(0, torch.ones_like(f), f)]
     if degree == 3:
         left, right = r**3 / 6, f**3 / 6
         high = torch.addcmul(2 / 3 + 3 * left, r, r, value=-1) + right
@@ -185,6 +187,31 @@ def gradients(image: Tensor) -> Tensor:
     _, rows = _spline_matrices(image.shape[-2], 3, image.device)
     _, columns = _spline_matrices(image.shape[-1], 3, image.device)
     return torch.cat((image @ columns.mT, rows @ image), 1)
+
+
+def aliasing(image: Tensor, interpolation: str) -> Tensor:
+    """What ``interpolation`` gets wrong when (B, 1, H, W) lies a quarter px off the grid in x, and in y: (B, 2, H, W).
+
+    Grey levels, at a quarter px because there the shift that it feigns is largest; against the quintic spline.
+    """
+    rows, columns = (_alias(n, interpolation, image.device) for n in image.shape[-2:])
+    return torch.cat((image @ columns.mT, rows @ image), 1)
+
+
+@lru_cache(maxsize=64)
+def _alias(n: int, interpolation: str, device: torch.device) -> Tensor:
+    """Samples of a signal to the error in them after it was sampled a quarter px off and interpolated back, (n, n)."""
+    exact, degree = _quarter(n, 5), 1 if interpolation == "bilinear" else int(interpolation[-1])
+    return ((_quarter(n, degree) - exact) @ exact.flip(0, 1)).to(device)
+
+
+def _quarter(n: int, degree: int) -> Tensor:
+    """Samples to the values that a spline of ``degree`` 1, 3 or 5 finds a quarter px after them, (n, n)."""
+    index, f, taps = torch.arange(n), torch.tensor(0.25), torch.zeros(n, n)
+    for first, total, second in _pairs(f, degree):
+        taps[index, _mirror(index + first, n)] += total - second
+        taps[index, _mirror(index + first + 1, n)] += second
+    return taps if degree == 1 else taps @ _spline_matrices(n, degree, taps.device)[0]
 
 
 def pad(image: Tensor, margin: int) -> Tensor:
