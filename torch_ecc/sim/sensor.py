@@ -43,10 +43,10 @@ def noise_sigma(variance: float) -> float:
     return WHITE * sqrt(variance)
 
 
-def generator(seed: int, index: int) -> torch.Generator:
-    """Random numbers of one frame: the same whatever batch, worker or device asks, unrelated to other frames'."""
-    # torch's CPU generator keeps 32 bits of its seed: hash both numbers into them instead of adding.
-    word = int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
+def generator(seed: int, *keys: int) -> torch.Generator:
+    """Random numbers of one frame or stage: the same whatever batch, worker or device asks, unrelated to others'."""
+    # torch's CPU generator keeps 32 bits of its seed: hash all numbers into them instead of adding.
+    word = int(np.random.SeedSequence((seed, *keys)).generate_state(1)[0])
     return torch.Generator().manual_seed(word)
 
 

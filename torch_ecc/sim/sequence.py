@@ -21,13 +21,15 @@ T = TypeVar("T")
 class Sequence:
     """F frames of ``scene`` at ``poses`` (F, 3) px, px, rad, on the device of the poses.
 
-    A frame depends on its index and on ``seed`` only: any order, batch or process gives the same frames.
+    A frame depends on its index and on ``seed`` only: any order, batch or process gives the same frames. ``velocities``
+    (F, 3) px, px, rad per frame time smear the exposure; without them they are central differences of the poses.
     """
 
     scene: Scene
     poses: Tensor
     camera: Camera = field(default_factory=Camera)
     seed: int = 0
+    velocities: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.poses.dim() != 2 or self.poses.shape[1] != 3 or len(self.poses) == 0:
@@ -36,6 +38,9 @@ class Sequence:
             raise ValueError("Sequence: poses must be finite")
         if self.seed < 0:
             raise ValueError(f"Sequence: seed must be >= 0, got {self.seed}")
+        if self.velocities is not None and self.velocities.shape != self.poses.shape:
+            shapes = f"{tuple(self.poses.shape)}, got {tuple(self.velocities.shape)}"
+            raise ValueError(f"Sequence: velocities must have the shape of the poses, {shapes}")
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -49,8 +54,9 @@ class Sequence:
         """Frames ``start`` <= i < ``stop``: (B, 1, h, w) uint8, uint16 or float32. IndexError outside the sequence."""
         if not 0 <= start < stop <= len(self):
             raise IndexError(f"Sequence: frames {start} to {stop} of {len(self)}")
-        velocities = velocity(self.poses)[start:stop] if self.camera.exposure > 0 else None
-        poses = self.poses[start:stop]
+        poses, velocities = self.poses[start:stop], None
+        if self.camera.exposure > 0:
+            velocities = (velocity(self.poses) if self.velocities is None else self.velocities)[start:stop]
         return self.camera.capture(self.scene, poses, velocities=velocities, seed=self.seed, first=start)
 
     def batches(self, size: int = 8) -> Iterator[Tensor]:
