@@ -159,6 +159,10 @@ def test_wrong_pose_tables_are_refused(tmp_path, text, message):
         ({"poses": torch.zeros(0, 3)}, r"poses must be \(F, 3\) with F >= 1, got \(0, 3\)"),
         ({"poses": torch.full((2, 3), math.nan)}, "poses must be finite"),
         ({"poses": torch.zeros(2, 3), "seed": -1}, "seed must be >= 0, got -1"),
+        (
+            {"poses": torch.zeros(2, 3), "velocities": torch.zeros(3, 3)},
+            r"velocities must have the shape of the poses, \(2, 3\), got \(3, 3\)",
+        ),
     ],
 )
 def test_wrong_sequences_are_refused(sequence_settings, message):

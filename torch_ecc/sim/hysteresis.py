@@ -39,10 +39,10 @@ class Ramps(NamedTuple):
 class Hysteresis:
     """Settings of the model; the weights sum to 1, so that an actuator never moves further than told."""
 
-    share: float = 0.3  # of the stroke that goes through the plays, w_1 + w_2 + ...; 0 has no hysteresis
-    spacing_um: float = 1.0  # alpha
+    share: float = 0.4  # of the stroke that goes through the plays, w_1 + w_2 + ...; 0 has no hysteresis
+    spacing_um: float = 1.25  # alpha
     lag_s: float = 2e-4  # beta: 0 is rate-independent
-    decay_um: float = 8.0  # rho
+    decay_um: float = 12.0  # rho
     plays: int = 10
 
     def __post_init__(self) -> None:
@@ -80,13 +80,12 @@ class Hysteresis:
         turns = plays.diff(dim=-3)
         # Going up a play follows its lower edge, going down its upper one; it rests until the edge has come.
         edge = torch.where(turns > 0, low.diff(dim=-3), high.diff(dim=-3))
-        moving = turns != 0
-        share = torch.where(moving, turns / torch.where(moving, edge, torch.ones_like(edge)), torch.zeros_like(turns))
+        moving = (turns / edge).nan_to_num(0.0).clamp(0, 1)  # part of the step; 0 / 0 where nothing moves
         weights = self.weights(stroke)
-        every = torch.cat((stroke[..., None], plays), -1)
-        slope = torch.cat((moves[..., None], torch.where(moving, edge, torch.zeros_like(edge))), -1) / step_s
-        duration = torch.cat((torch.ones_like(moves)[..., None], share.clamp(0, 1)), -1) * step_s
-        return Ramps(every[..., :-1, :, :] @ weights, slope * weights, duration)
+        start = torch.cat((stroke[..., None], plays), -1)[..., :-1, :, :]
+        slope = torch.cat((moves[..., None], edge), -1) / step_s
+        duration = torch.cat((torch.ones_like(moves)[..., None], moving), -1) * step_s
+        return Ramps(start @ weights, slope * weights, duration)
 
 
 def play(low: Tensor, high: Tensor) -> Tensor:

@@ -11,9 +11,9 @@ its direction turns with the part: theta is the anti-trigonometric atan2 of the 
 direction at theta = 0 and P_2 - P_1. Then R n_i . t = R n_i . P_i - c_i for i = 1, 3 are two linear equations for x, y.
 That is exact for any mounting and any |theta| < 90 degrees.
 
-Limits: with sensors 1 and 2 a baseline D apart and square to the face tan theta = (d_1 - d_2) / D or its negative by
-the side they look from; for small angles theta = (d_1 - d_2) / D, and noise sigma of a distance is sqrt(2) sigma / D of
-theta and sigma / sqrt(2) of the translation along the normal if the origin's foot is midway.
+Limits: with sensors 1 and 2 a baseline D apart (``place_um`` of 2 less that of 1) and square to the face
+tan theta = (d_1 - d_2) / D; for small angles theta = (d_1 - d_2) / D, and noise sigma of the distances makes
+sqrt(2) sigma / D of theta and sigma / sqrt(2) of the translation along the normal if its foot is midway.
 """
 
 from __future__ import annotations
@@ -35,11 +35,7 @@ class Mounting:
     The default has two sensors 30 mm apart that look at the y face and one at the x face.
     """
 
-    place_um: tuple[float, float, float] = (
-        15000.0,
-        -15000.0,
-        0.0,
-    )  # along the face, from its normal through the origin
+    place_um: tuple[float, float, float] = (-15000.0, 15000.0, 0.0)  # along the face, from its normal foot
     standoff_um: tuple[float, float, float] = (100.0, 100.0, 100.0)  # from the face
     tilt_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the sensor's axis against the normal
     normal_rad: tuple[float, float] = (pi / 2, 0.0)  # outward normals: of the face of sensors 1 and 2, and of 3

@@ -62,8 +62,9 @@ class StageSettings:
             raise ValueError(f"StageSettings: workspace, lever, natural_hz and times must be > 0, got {lengths}")
         if not all(0 < ratio < 1 for ratio in self.damping):
             raise ValueError(f"StageSettings: damping must be in (0, 1), got {self.damping}")
-        if not min(self.creep, self.drift_um, self.drift_urad) >= 0:
-            raise ValueError("StageSettings: creep and drift must be >= 0")
+        for name in ("creep", "drift_um", "drift_urad"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"StageSettings: {name} must be >= 0, got {getattr(self, name)}")
         if len(self.compliance) != 3 or any(len(row) != 3 for row in self.compliance):
             raise ValueError(f"StageSettings: compliance must be 3 x 3, got {self.compliance}")
 
