@@ -124,6 +124,10 @@ def test_the_lens_shakes_in_the_images_only():
         (lambda: SMALL.poses_px(torch.zeros(5, 2)), r"poses_px: poses must be \(..., 3\), got \(5, 2\)"),
         (lambda: SMALL.times(motion(), start_s=0.6), "times: start_s must leave room for a frame"),
         (
+            lambda: SMALL.film(WAVES, motion(), camera=Microscope().camera()),
+            r"film: the camera must have the size \(48, 64\) of the region, got \(480, 640\)",
+        ),
+        (
             lambda: SMALL.film(WAVES, Stage(batch=2).run(torch.zeros(9, 3), 1.0)),
             r"film: the motion must be of one stage, \(T, 3\), got \(2, 9, 3\)",
         ),

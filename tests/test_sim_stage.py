@@ -354,6 +354,7 @@ def test_everything_stays_on_the_device_of_the_command(device):
 def test_plant_without_creep_is_the_mode_alone():
     plant = Plant.of(torch.tensor((100.0,)).double(), torch.tensor((0.1,)).double())
     assert plant.poles.shape == (1,)
+    assert Stage(StageSettings(creep_s=())).run(circle(64.0), 64.0).pose.isfinite().all()
     settled = plant.output(plant.rest(torch.tensor((2.5,)).double()))
     torch.testing.assert_close(settled, torch.tensor((2.5,)).double())
     assert float(plant.poles[0].imag / plant.poles[0].real) == pytest.approx(-sqrt(1 - 0.01) / 0.1)

@@ -7,8 +7,8 @@ hysteresis in a piezomicropositioning actuator", IEEE/ASME Trans. Mechatronics 1
 
 F_i is the play of half width r_i: it stays until u pushes it, F(t) = max(u - r, min(u + r, F(t-))). Between samples u
 and r run straight, so that a play rests first and then follows a straight line: it is known exactly at all times. The
-sizes (see ``StageSettings``) give what makers state of open-loop piezos: loops of 2 % for small moves to 10-15 % of
-large ones (Physik Instrumente, Piezo Tutorial).
+default sizes are no actuator's own; they are chosen for what makers state of open-loop piezos, loops that open by 2 %
+of small moves and 10-15 % of large ones (Physik Instrumente, Piezo Tutorial).
 """
 
 from __future__ import annotations

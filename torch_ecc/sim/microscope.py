@@ -109,10 +109,13 @@ class Microscope:
         """The frames of a ``scene`` on a single stage, the first exposure opening at ``start_s`` of the motion's clock.
 
         The exposure is smeared along the secant of the motion while it is open. The poses of the sequence are those at
-        the middles of the exposures, at ``times(motion, start_s=start_s)``. ValueError for a batch of stages.
+        the middles of the exposures, at ``times(motion, start_s=start_s)``. ValueError for a batch of stages and for a
+        camera of another size.
         """
         if motion.pose.dim() != 2:
             raise ValueError(f"film: the motion must be of one stage, (T, 3), got {tuple(motion.pose.shape)}")
+        if camera is not None and camera.size != self.region_px:
+            raise ValueError(f"film: the camera must have the size {self.region_px} of the region, got {camera.size}")
         times = self.times(motion, start_s=start_s)
         column = self._column(seed)
 

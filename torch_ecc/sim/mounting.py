@@ -91,15 +91,15 @@ def calibrate_mounting(distance_um: Tensor, poses: Tensor, nominal: Mounting) ->
 
     Gauss-Newton over the places along the faces, the standoffs and the normals of the faces. Tilts and the distances of
     the faces stay those of the drawing: within a nanopositioner's range they change distances by less than a sensor
-    resolves. Raises ValueError for shapes that do not match, fewer than four poses and poses that do not move in
-    x, y and theta.
+    resolves. Clipped readings are for the caller to leave out. Raises ValueError for shapes that do not match, fewer
+    than four poses and poses that do not move in x, y and theta.
     """
     if distance_um.dim() != 2 or distance_um.shape[-1] != 3 or distance_um.shape != poses.shape:
         shapes = f"{tuple(distance_um.shape)} and {tuple(poses.shape)}"
         raise ValueError(f"calibrate_mounting: distances and poses must both be (N, 3), got {shapes}")
     if not bool(distance_um.isfinite().all() and poses.isfinite().all()):
         raise ValueError("calibrate_mounting: distances and poses must be finite")
-    poses = poses.double()
+    poses, distance_um = poses.double(), distance_um.double()
     moves = (poses - poses.mean(0)) * poses.new_tensor((1.0, 1.0, 1e4))  # theta as um at the sensors
     spread = torch.linalg.svdvals(moves)
     if len(poses) < 4 or spread[-1] <= 1e-6 * spread[0]:

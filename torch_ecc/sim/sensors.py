@@ -77,7 +77,10 @@ class Sensors:
         return SensorRecord(times, *self.read(motion.at(times)))
 
     def read(self, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances in um and where they were clipped, for poses (..., T, 3) um, um, rad: two (..., T, 3)."""
+        """Distances in um and where they were clipped, for poses (..., T, 3) um, um, rad: two (..., T, 3).
+
+        The same call gives the same noise.
+        """
         if poses.dim() < 2 or poses.shape[-1] != 3:
             raise ValueError(f"read: poses must be (..., T, 3), got {tuple(poses.shape)}")
         if self.batch and poses.dim() > 2 and poses.shape[-3] not in (1, self.batch):
@@ -91,7 +94,7 @@ class Sensors:
         noise = torch.stack([torch.randn(poses.shape[-2], 3, generator=g, dtype=torch.float64) for g in sources])
         if self.batch is None:
             kinds, noise = kinds[0], noise[0]
-        second, third = self._bends(exact)
+        second, third = bends(s, exact)
         bend = kinds.cos().to(exact) * second + kinds.sin().to(exact) * third
         value = exact + bend + s.noise_um * noise.to(exact)
         low, high = s.range_um
@@ -101,12 +104,16 @@ class Sensors:
             value = (value / s.resolution_um).round() * s.resolution_um
         return value, saturated
 
-    def _bends(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """The two shapes of non-linearity in um, Legendre's second and third; a sensor has them in its own mixture."""
-        s = self.settings
-        x = 2 * (distance - s.range_um[0]) / s.span_um - 1
-        size = s.nonlinearity * s.span_um / 2**0.5
-        return size * (1.5 * x**2 - 0.5), size * (2.5 * x**3 - 1.5 * x)
+
+def bends(settings: SensorSettings, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Two shapes of non-linearity in um at distances (...) um, Legendre's second and third.
+
+    A sensor has cos(psi) of the one and sin(psi) of the other with a psi of its own; what offset and gain would take
+    out is left out.
+    """
+    x = 2 * (distance - settings.range_um[0]) / settings.span_um - 1
+    size = settings.nonlinearity * settings.span_um / 2**0.5
+    return size * (1.5 * x**2 - 0.5), size * (2.5 * x**3 - 1.5 * x)
 
 
 class ErrorBudget(NamedTuple):
@@ -134,8 +141,7 @@ def error_budget(settings: SensorSettings, poses: Tensor, *, mounting_covariance
     numbers = settings.mounting.numbers().to(poses.device)
     exact, zero = geometry.distance(numbers, poses), geometry.distance(numbers, torch.zeros_like(poses[:1]))
     to_pose = torch.func.vmap(torch.func.jacfwd(lambda d: geometry.pose(numbers, d)))(exact)
-    sensors = Sensors(settings)
-    bends = [a - b for a, b in zip(sensors._bends(exact), sensors._bends(zero), strict=True)]
+    second, third = (a - b for a, b in zip(bends(settings, exact), bends(settings, zero), strict=True))
 
     def spread(variance: Tensor) -> Tensor:
         """Of the pose from independent variances (N, 3) of the distances."""
@@ -146,7 +152,7 @@ def error_budget(settings: SensorSettings, poses: Tensor, *, mounting_covariance
     parts = [
         spread(settings.resolution_um**2 / 12 * even),
         spread(settings.noise_um**2 * even),
-        spread((bends[0] ** 2 + bends[1] ** 2) / 2),
+        spread((second**2 + third**2) / 2),
         torch.zeros_like(exact),
     ]
     if mounting_covariance is not None:

@@ -101,7 +101,7 @@ class Stage:
             raise ValueError(f"Stage: batch must be >= 1, seed and first >= 0, got {batch}, {seed}, {first}")
         sources = [sensor.generator(seed, i) for i in range(first, first + (batch or 1))]
         drift = torch.stack([torch.randn(1, 3, generator=g, dtype=torch.float64) for g in sources])
-        self.drift = drift * torch.tensor((s.drift_um, s.drift_um, 1e-6 * s.drift_urad))
+        self.drift = drift * _column((s.drift_um, s.drift_um, 1e-6 * s.drift_urad))
         natural, damping = _column(s.natural_hz), _column(s.damping)
         self.vibration = Vibration.on(s.floor, natural, damping, sources=sources)
         if batch is None:
@@ -109,7 +109,9 @@ class Stage:
         gains = torch.full((len(s.creep_s),), s.creep, dtype=torch.float64)
         self.plant = Plant.of(natural, damping, creep=gains, creep_s=_column(s.creep_s))
         angles = _column(ACTUATORS_RAD)
-        self.geometry = torch.stack((angles.cos(), angles.sin(), torch.ones(3)), 1)  # (x, y, lever theta) to strokes
+        self.geometry = torch.stack(
+            (angles.cos(), angles.sin(), torch.ones_like(angles)), 1
+        )  # (x, y, lever theta) to strokes
         self.mix = _column(s.compliance) @ torch.linalg.inv(self.geometry)
 
     def run(self, command: Tensor, rate_hz: float) -> StageMotion:

@@ -52,7 +52,12 @@ class Vibration:
         q = frequency[:, None] / natural_hz
         transmitted = q**2 / torch.complex(1 - q**2, 2 * damping * q).abs()
         speed = floor.speed_um_s * (3 * octaves / LINES) ** 0.5
-        size = speed / (tau * frequency[:, None]) * transmitted / torch.tensor((1.0, 1.0, floor.rocking_um))
+        size = (
+            speed
+            / (tau * frequency[:, None])
+            * transmitted
+            / torch.tensor((1.0, 1.0, floor.rocking_um), dtype=torch.float64)
+        )
         draws = [torch.randn(2, LINES, 3, generator=g, dtype=torch.float64) for g in sources]
         return cls(frequency, (torch.stack(draws) * size).flatten(1, 2))
 
