@@ -36,7 +36,7 @@ def workspace(count: int, seed: int = 0) -> torch.Tensor:
     return (2 * torch.rand(count, 3, generator=g, dtype=torch.float64) - 1) * half
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(
     st.floats(-30, 30),
     st.floats(-30, 30),
