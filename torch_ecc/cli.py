@@ -107,6 +107,39 @@ def simulate(config: str, out: str) -> None:
     console.print(f"  torch-ecc track {out}/frames --center {x:g} {y:g} --size {w}x{h}", soft_wrap=True)
 
 
+@app.command()
+@click.argument("names", nargs=-1, metavar="NAME...")
+@click.option("--quick", is_flag=True, help="Short versions of all experiments.")
+@click.option("--out", default="torch-ecc-reproduce", show_default=True, help="Folder for pictures, numbers, report.")
+def reproduce(names: tuple[str, ...], quick: bool, out: str) -> None:
+    """Reproduce the paper's figures and tables, with our numbers beside the paper's.
+
+    NAME is fig2, fig3, fig4, table1, ... or all. DIR/report.html collects everything that was reproduced in DIR.
+    """
+    from torch_ecc.experiments.reproduce import chosen, run
+
+    try:
+        for name in chosen(names):
+            with progress_bar(name, unit="steps") as advance:
+                outcome = run(name, out, quick, advance)
+            _say_numbers(outcome)
+    except KeyboardInterrupt:
+        console.print(f"Stopped from the keyboard. What was finished before is in {out}/", soft_wrap=True)
+        sys.exit(INTERRUPTED)
+    console.print(f"Report: {out}/report.html", soft_wrap=True)
+
+
+def _say_numbers(outcome: Any) -> None:
+    """How many numbers keep their limits, and which do not."""
+    limited = [record for record in outcome.records if record.tolerance is not None]
+    missed = [record for record in limited if not record.kept]
+    if limited:
+        console.print(f"{outcome.name}: {len(limited) - len(missed)} of {len(limited)} numbers are within their limits")
+    for record in missed:
+        text = f"  not kept: {record.name}: {record.value:.4g} {record.unit}, limit {record.tolerance:.4g}"
+        console.print(text, soft_wrap=True, markup=False)
+
+
 def _size(text: str) -> int | list[int]:
     parts = text.lower().split("x")
     if not (1 <= len(parts) <= 2 and all(part.strip().isdecimal() for part in parts)):
@@ -141,17 +174,21 @@ def _report(outcome: Any) -> None:
 
 
 class _Rate(ProgressColumn):
-    """Frames per second."""
+    """Frames, or whatever is counted, per second."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self.unit = unit
 
     def render(self, task: RichTask) -> Text:
         speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.0f} frames/s")
+        return Text("" if speed is None else f"{speed:.0f} {self.unit}/s")
 
 
 @contextmanager
-def progress_bar(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
+def progress_bar(title: str, total: int | None = None, unit: str = "frames") -> Iterator[Callable[..., None]]:
     """A bar with the rate; yields a function that advances it by one, or sets (done, total) when given them."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(unit), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(title, total=total)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -87,7 +88,29 @@ def _processor() -> str:
 
 
 def save_records(outcome: Outcome, path: Path, about: Mapping[str, Any]) -> None:
-    """The numbers of an experiment as JSON, with what they depend on."""
-    rows = [{k: v for k, v in record._asdict().items() if v is not None} for record in outcome.records]
-    document = {"experiment": outcome.name, "seed": outcome.seed, **about, "records": rows}
-    path.write_text(json.dumps(document, indent=2) + "\n")
+    """Everything of an experiment but its pixels as JSON, with what the numbers depend on (``about``).
+
+    A number that is not finite is null; whether a number keeps its limit is said beside it.
+    """
+    document = {
+        "experiment": outcome.name,
+        "title": outcome.title,
+        "seed": outcome.seed,
+        **about,
+        "pictures": [{"file": f"{picture.name}.png", "caption": picture.caption} for picture in outcome.pictures],
+        "tables": [table._asdict() for table in outcome.tables],
+        "remarks": list(outcome.remarks),
+        "records": [_row(record) for record in outcome.records],
+    }
+    path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _row(record: Record) -> dict[str, Any]:
+    value = record.value if math.isfinite(record.value) else None
+    return {k: v for k, v in record._asdict().items() if v is not None} | {"value": value, "kept": record.kept}
+
+
+def load_records(path: Path) -> dict[str, Any]:
+    """What ``save_records`` wrote."""
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return document
