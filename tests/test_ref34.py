@@ -11,6 +11,7 @@ from torch_ecc import align, prepare
 from torch_ecc.experiments.ref34 import Ref34, jacobian, pixels
 from torch_ecc.pose import transform
 from torch_ecc.reference import MARGIN
+from torch_ecc.sampling import gradients
 from torch_ecc.sim import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=1)
@@ -29,7 +30,8 @@ def test_jacobian_is_the_derivative_of_the_sampled_patch(theta):
     truth = torch.tensor([0.0, 0.0, theta], dtype=torch.float64)
     back = torch.tensor([0.0, 0.0, -theta], dtype=torch.float64)
     exact = torch.func.jacfwd(lambda p: SCENE.value(transform(back, transform(p, points))))(truth)
-    J = jacobian(template(), truth[2:])[0].double()
+    inner = slice(MARGIN, -MARGIN)
+    J = jacobian(gradients(template())[:, :, inner, inner], truth[2:])[0].double()
     assert ((J - exact).square().mean(0).sqrt() < 0.02 * exact.square().mean(0).sqrt()).all()
 
 

@@ -6,6 +6,9 @@ of the sampled patch by the pose is
     J(theta) = grad h R(theta)^T [ I | dR/dtheta x' ] = [ grad h R(theta)^T | grad h (y', -x') ],
 
 taken at the theta where a frame starts and kept during that frame's iterations p <- p - (J^T J)^-1 J^T (g - h).
+
+grad h is that of the slightly blurred template. Raw differences hold the template's own noise, which inflates the
+Hessian: with the noise of Fig. 4 steps become so short that 15 of them lose the motion of the paper's simulation.
 """
 
 from __future__ import annotations
@@ -14,19 +17,17 @@ import torch
 from torch import Tensor
 
 from torch_ecc.pose import rotation
-from torch_ecc.reference import MARGIN
-from torch_ecc.sampling import Sampler, gradients, make_sampler
+from torch_ecc.reference import INSTRUMENT_BLUR, MARGIN
+from torch_ecc.sampling import Sampler, blur, gradients, make_sampler
 from torch_ecc.solver import COARSE_TOLERANCE
 
 
-def jacobian(templates: Tensor, theta: Tensor) -> Tensor:
-    """J(theta) (R, N, 3) of templates (R, 1, h + 2 MARGIN, w + 2 MARGIN) at angles (R,), eqs. (7), (8)."""
-    inner = slice(MARGIN, -MARGIN)
-    gradient = gradients(templates)[:, :, inner, inner]
+def jacobian(gradient: Tensor, theta: Tensor) -> Tensor:
+    """J(theta) (R, N, 3) of templates with ``gradient`` (R, 2, h, w) at angles (R,), eqs. (7), (8)."""
     x, y, _ = pixels((gradient.shape[-2], gradient.shape[-1]))
-    across = gradient.flatten(2).mT  # grad h, (R, N, 2)
-    turned = across @ rotation(theta).mT.to(across.dtype)
-    return torch.cat((turned, (across[..., 0] * y - across[..., 1] * x)[..., None]), -1)
+    gx, gy = gradient.flatten(2).unbind(1)
+    turned = gradient.flatten(2).mT @ rotation(theta).mT.to(gradient.dtype)
+    return torch.cat((turned, (gx * y - gy * x)[..., None]), -1)
 
 
 def pixels(size: tuple[int, int]) -> Tensor:
@@ -50,21 +51,23 @@ class Ref34:
         max_iterations: int = 15,
         tolerance: float = 1e-3,
     ) -> None:
-        self.templates, self.pose, self.interpolation = templates.float(), pose.clone(), interpolation
+        self.pose, self.interpolation = pose.clone(), interpolation
         self.max_iterations, self.tolerance = max_iterations, tolerance
+        self.iterations = torch.zeros(len(pose), dtype=torch.int64)  # of the last frame
+        inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
+        self.gradient = gradients(blur(templates.float(), INSTRUMENT_BLUR))[inner].contiguous()
+        self.h = templates[inner].flatten(1).float()
         h, w = (n - 2 * MARGIN for n in templates.shape[-2:])
-        self.h = self.templates[:, 0, MARGIN:-MARGIN, MARGIN:-MARGIN].flatten(1)
         self.pixels = pixels((h, w))
         self.box = self.pixels[:, [0, w - 1, h * w - 1, (h - 1) * w]]
         radius = float(self.box[:2, 0].norm())
         self.lever = pose.new_tensor((1.0, 1.0, radius))
 
     def precompute(self) -> Tensor:
-        """What this method does before each frame: gradient, J(theta) and (J^T J)^-1 J^T, (R, 3, N)."""
-        J = jacobian(self.templates, self.pose[:, 2])
-        hessian = (J.mT @ J).double()
-        solve: Tensor = torch.linalg.inv(hessian) @ J.mT.double()
-        return solve.to(J.dtype)
+        """What this method does before each frame: J(theta) and (J^T J)^-1 J^T, (R, 3, N)."""
+        J = jacobian(self.gradient, self.pose[:, 2])
+        solve: Tensor = torch.linalg.inv((J.mT @ J).double()).to(J.dtype) @ J.mT
+        return solve
 
     def sampler(self, image: Tensor, interpolation: str) -> Sampler:
         """The sampler of frames (1 or R, 1, H, W), float32, around the present poses."""
@@ -85,7 +88,7 @@ class Ref34:
     def track(self, frame: Tensor) -> Tensor:
         """Poses (R, 3) px, px, rad in the next frame (1 or R, 1, H, W)."""
         image, solve = frame.float(), self.precompute()
-        budget = self.max_iterations
+        budget, self.iterations = self.max_iterations, torch.zeros_like(self.iterations)
         if self.interpolation != "bilinear" and budget > 1:
             coarse = budget * 2 // 3
             self._stage(self.sampler(image, "bilinear"), solve, max(self.tolerance, COARSE_TOLERANCE), coarse)
@@ -98,6 +101,7 @@ class Ref34:
         last = torch.full_like(self.pose[:, 0], torch.inf)
         for _ in range(budget):
             length = self.iterate(sample, solve)
+            self.iterations += 1
             rate = torch.where(last.isfinite(), length / last, 0.5).clamp(0.05, 0.95)
             if not bool((length * rate / (1 - rate) > tolerance).any()):
                 break

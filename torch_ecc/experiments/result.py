@@ -66,6 +66,12 @@ class Outcome(NamedTuple):
     seed: int = 0
 
 
+def counter(total: int, advance: Advance) -> Callable[[], None]:
+    """A function that advances by one of ``total`` every time it is called."""
+    done = iter(range(1, total + 1))
+    return lambda: advance(next(done), total)
+
+
 def environment() -> dict[str, str]:
     """Versions, threads and machine that numbers depend on."""
     return {

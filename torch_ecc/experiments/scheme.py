@@ -119,7 +119,8 @@ class Turned:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """A scene rendered once: ``frames`` (B, 1, H, W) stand for its rendering at the same B poses, by any camera."""
+    """A scene rendered once: ``frames`` (1 or B, 1, H, W) stand for its rendering at the same pose or poses, for
+    any number of cameras and draws of the noise."""
 
     scene: Scene
     frames: Tensor
@@ -133,6 +134,6 @@ class Kept:
         return self.scene.gradient(points)
 
     def render(self, poses: Tensor, size: tuple[int, int]) -> Tensor:
-        """The middle (B, 1, h, w) of the frames kept."""
+        """The middle (B, 1, h, w) of the frames kept, for B poses."""
         top, left = ((have - want) // 2 for have, want in zip(self.frames.shape[-2:], size, strict=True))
-        return self.frames[:, :, top : top + size[0], left : left + size[1]]
+        return self.frames[:, :, top : top + size[0], left : left + size[1]].expand(len(poses), -1, -1, -1)
