@@ -15,7 +15,7 @@ from torch_ecc.experiments.report import write_report
 from torch_ecc.experiments.result import Advance, Outcome, environment, load_records, save_records
 from torch_ecc.io.output import check_folder, part, publish
 
-NAMES = ("fig2", "fig3", "fig4", "table1")
+NAMES = ("fig2", "fig3", "fig4", "table1", "robustness")
 RECORDS = "records.json"
 DPI = 130
 
