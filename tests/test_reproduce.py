@@ -114,7 +114,7 @@ def test_report_escapes_every_text(tmp_path):
 
 
 def test_run_keeps_what_was_done_and_an_interruption_loses_only_what_was_going_on(tmp_path):
-    last = reproduce.NAMES[-1]
+    last = "fig3"
     reproduce.save(outcome(last), tmp_path / last, quick=False, seconds=1.0)
     reproduce.run("fig2", tmp_path, True, lambda done, total: None)
     before = read(tmp_path / "report.html").fetched
@@ -169,3 +169,13 @@ def test_the_command_says_what_was_kept(tmp_path):
     assert f"Report: {tmp_path}/r/report.html" in done.output
     (picture,) = load_records(tmp_path / "r" / "fig2" / "records.json")["pictures"]
     assert (tmp_path / "r" / "fig2" / picture["file"]).read_bytes().startswith(PNG)
+
+
+def test_ctrl_c_is_said_in_words(tmp_path, monkeypatch):
+    def stopped(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reproduce, "run", stopped)
+    done = CliRunner().invoke(app, ["reproduce", "all", "--out", str(tmp_path)])
+    assert done.exit_code == 130
+    assert "Stopped from the keyboard. What was finished before is in" in done.output
