@@ -17,6 +17,7 @@ from torch_ecc.experiments import reproduce
 from torch_ecc.experiments.report import write_report
 from torch_ecc.experiments.result import Outcome, Picture, Record, Table, load_records
 
+QUICK, FULL = ({"quick": quick, "seconds": 2.0, "cpu_seconds": 1.0} for quick in (True, False))
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -61,7 +62,7 @@ def read(path) -> Page:
 
 
 def test_records_are_strict_json_with_what_they_depend_on(tmp_path):
-    reproduce.save(outcome(), tmp_path, quick=True, seconds=1.25)
+    reproduce.save(outcome(), tmp_path, QUICK)
 
     def refuse(word: str) -> None:
         raise AssertionError(word)
@@ -77,15 +78,15 @@ def test_records_are_strict_json_with_what_they_depend_on(tmp_path):
 
 
 def test_pictures_of_an_earlier_run_do_not_stay(tmp_path):
-    reproduce.save(outcome(pictures=("a", "b")), tmp_path, quick=False, seconds=1.0)
+    reproduce.save(outcome(pictures=("a", "b")), tmp_path, FULL)
     (tmp_path / "mine.png").write_bytes(b"not ours")
-    reproduce.save(outcome(pictures=("b", "c")), tmp_path, quick=True, seconds=1.0)
+    reproduce.save(outcome(pictures=("b", "c")), tmp_path, QUICK)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b.png", "c.png", "mine.png", "records.json"]
 
 
 def test_report_is_one_self_contained_page(tmp_path):
     for name in ("fig2", "fig3"):
-        reproduce.save(outcome(name, ("p", "q")), tmp_path / name, quick=True, seconds=1.0)
+        reproduce.save(outcome(name, ("p", "q")), tmp_path / name, QUICK)
     write_report(tmp_path / "report.html", [tmp_path / n / "records.json" for n in ("fig2", "fig3")])
     page = read(tmp_path / "report.html")
     links = [link for link in page.fetched if link.startswith("#")]
@@ -106,7 +107,7 @@ def test_report_escapes_every_text(tmp_path):
     o = outcome(remark=nasty)._replace(title=nasty, tables=[Table(nasty, (nasty,), [(nasty,)], nasty)])
     o = o._replace(records=[Record(nasty, 1.0, "<i>", tolerance=2.0), Record(nasty, 1.0, "<i>")])
     o = o._replace(pictures=[o.pictures[0]._replace(caption=nasty)])
-    reproduce.save(o, tmp_path / "fig2", quick=True, seconds=1.0)
+    reproduce.save(o, tmp_path / "fig2", QUICK)
     write_report(tmp_path / "report.html", [tmp_path / "fig2" / "records.json"])
     page = read(tmp_path / "report.html")
     assert not {"script", "i"} & set(page.tags)
@@ -115,7 +116,7 @@ def test_report_escapes_every_text(tmp_path):
 
 def test_run_keeps_what_was_done_and_an_interruption_loses_only_what_was_going_on(tmp_path):
     last = "fig3"
-    reproduce.save(outcome(last), tmp_path / last, quick=False, seconds=1.0)
+    reproduce.save(outcome(last), tmp_path / last, FULL)
     reproduce.run("fig2", tmp_path, True, lambda done, total: None)
     before = read(tmp_path / "report.html").fetched
     assert {"#fig2", f"#{last}"} <= set(before)

@@ -71,7 +71,8 @@ def _overview(documents: Sequence[dict[str, Any]]) -> str:
 
 def _section(document: dict[str, Any], folder: Path) -> str:
     length = "Quick run" if document["quick"] else "Full run"
-    about = [f"{length}, {document['seconds']:.1f} s, seed {document['seed']}"]
+    spent = f"{document['seconds']:.1f} s, {document['cpu_seconds']:.1f} s of a processor"
+    about = [f"{length}, {spent}, seed {document['seed']}"]
     about += [f"{name} {value}" for name, value in document["environment"].items()]
     parts = [
         f'<section id="{escape(document["experiment"])}"><h2>{escape(document["title"])}</h2>',

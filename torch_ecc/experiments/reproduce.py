@@ -6,10 +6,11 @@ The experiment NAME is ``run(quick, advance) -> Outcome`` of the module torch_ec
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from torch_ecc.experiments.report import write_report
 from torch_ecc.experiments.result import Advance, Outcome, environment, load_records, save_records
@@ -41,25 +42,27 @@ def run(name: str, out: str | Path, quick: bool, advance: Advance) -> Outcome:
     """
     folder = check_folder(out, "reproduce")
     chosen([name])
-    started = time.perf_counter()
+    started, worked = time.perf_counter(), time.process_time()
     outcome: Outcome = import_module(f"torch_ecc.experiments.{name}").run(quick, advance)
-    seconds = time.perf_counter() - started
-    save(outcome, folder / name, quick=quick, seconds=seconds)
+    spent = {"seconds": time.perf_counter() - started, "cpu_seconds": time.process_time() - worked}
+    save(outcome, folder / name, {"quick": quick} | {key: round(value, 1) for key, value in spent.items()})
     written = [path for each in NAMES if (path := folder / each / RECORDS).is_file()]
     write_report(part(folder, "report.html"), written)
     publish(folder, "report.html")
     return outcome
 
 
-def save(outcome: Outcome, folder: Path, *, quick: bool, seconds: float) -> None:
-    """Pictures and records of an experiment, in place of those of an earlier run."""
+def save(outcome: Outcome, folder: Path, about: Mapping[str, Any]) -> None:
+    """Pictures and records of an experiment, in place of those of an earlier run.
+
+    ``about`` holds how it was run: "quick", "seconds" and "cpu_seconds".
+    """
     folder.mkdir(parents=True, exist_ok=True)
     files = [f"{picture.name}.png" for picture in outcome.pictures]
     for picture, file in zip(outcome.pictures, files, strict=True):
         picture.figure.savefig(part(folder, file), dpi=DPI, format="png")
     date = datetime.now().astimezone().isoformat(timespec="seconds")
-    about = {"quick": quick, "seconds": round(seconds, 1), "date": date, "environment": environment()}
-    save_records(outcome, part(folder, RECORDS), about)
+    save_records(outcome, part(folder, RECORDS), {**about, "date": date, "environment": environment()})
     earlier = load_records(folder / RECORDS)["pictures"] if (folder / RECORDS).is_file() else []
     publish(folder, *files, RECORDS)
     for old in {picture["file"] for picture in earlier} - set(files):

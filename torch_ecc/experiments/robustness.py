@@ -80,12 +80,15 @@ REMARKS = (
     "grey levels in template and frame. Every method starts at the pose of the frame before.",
     f"Found: nearer than {FOUND:g} px to the truth at the template's corner. The red line counts what the default "
     "method calls a good pose and is not: the part of the failures that its status does not tell.",
-    "A jump or turn beyond the width of the texture leads into a neighbouring minimum, whatever the criterion. What "
-    "widens the basin is the pyramid; the search, the tracker's default, catches what is noticed as lost.",
+    "A jump or turn beyond the width of the texture leads into a neighbouring minimum, whatever the criterion, and on "
+    "a circuit of many equal cells that minimum often looks good enough to be believed. What widens the basin is the "
+    "pyramid; the search, the tracker's default, catches only what is noticed as lost. The columns for light cost some "
+    "of the basin.",
     "Contrast is no failure to ECC, which fits a gain: it works until the noise is as large as what is left. SSD takes "
     "a change of contrast for motion. Blur mixes in what lies around the template, which no method here models.",
-    "Nor does any model an occluder. A partly covered template is pulled aside and soon called LOST; a mask or a "
-    "smaller template serves better.",
+    "Nor does any model an occluder. A partly covered template is pulled aside and soon refused: below a correlation of "
+    "0.5 its status is LOST, and it counts as not found. Ref. 34 has no status and never refuses. A mask or a smaller "
+    "template serves better.",
 )
 
 
@@ -151,8 +154,8 @@ def _samplers(errors: Mapping[float, Mapping[str, Tensor]]) -> Picture:
             for name, values in by_sampler.items()
         }
         title = f"({letter}) noise of {noise:g} grey levels"
-        panels.append(Panel(title, ("error of x and y (px)", "share of the templates below"), curves, "x"))
-    return Picture("sampler", draw_panels(panels), "Errors of the default method by sampler, without and with noise.")
+        panels.append(Panel(title, ("error of x and y (px)", "share of the templates found"), curves, "x"))
+    return Picture("sampler", draw_panels(panels), "Errors of the default method by sampler: share below.")
 
 
 def _table(sweeps: Mapping[str, Sweep], found: Mapping[str, Found], count: int) -> Table:

@@ -139,13 +139,15 @@ def corner_error(pose: Tensor, truth: Tensor, size: int) -> Tensor:
 
 
 def sampler_errors(noise: float, count: int, samplers: Sequence[str], tick: Callable[[], None]) -> dict[str, Tensor]:
-    """Sorted errors (B,) px of x and y of the default method by sampler, both frames with ``noise`` grey levels."""
+    """Sorted errors px of x and y of the templates that the default method finds, by sampler; both frames have
+    ``noise`` grey levels."""
     both, view = pairs(count, JUMP, TURN), camera(noise_sigma=noise)
     first, frames = view.capture(scene(), both.first, seed=SEED), view.capture(scene(), both.second, seed=SEED + 1)
     template, start = Cut(MIDDLE, MIDDLE).template(first), MIDDLE.expand_as(both.truth)
     result = {}
     for name in samplers:
         pose = METHODS["linear"].start(template, start, name).track(frames)
-        result[name] = errors(pose, both.truth)[:, :2].norm(dim=-1).sort().values
+        error = errors(pose, both.truth)[:, :2].norm(dim=-1)
+        result[name] = error[error < FOUND].sort().values
     tick()
     return result
