@@ -86,9 +86,9 @@ REMARKS = (
     "of the basin.",
     "Contrast is no failure to ECC, which fits a gain: it works until the noise is as large as what is left. SSD takes "
     "a change of contrast for motion. Blur mixes in what lies around the template, which no method here models.",
-    "Nor does any model an occluder. A partly covered template is pulled aside and soon refused: below a correlation of "
-    "0.5 its status is LOST, and it counts as not found. Ref. 34 has no status and never refuses. A mask or a smaller "
-    "template serves better.",
+    "Nor does any model an occluder. A partly covered template is pulled aside and soon refused: below a correlation "
+    "of 0.5 its status is LOST, and it counts as not found. Ref. 34 has no status and never refuses. A mask or a "
+    "smaller template serves better.",
 )
 
 
