@@ -21,21 +21,22 @@ h2 { font-size: 1.35rem; margin-top: 3rem; border-top: 2px solid; padding-top: .
 a { color: #0b5c8a; }
 figure { margin: 1.5rem 0; }
 img { width: 100%; min-width: 40rem; height: auto; }
-figcaption, caption, .small { color: #555; font-size: .9rem; }
-caption { text-align: left; padding: .3rem 0; }
-caption b { color: #1b1b1b; font-size: 1rem; display: block; }
-.wide { overflow-x: auto; margin: 1.2rem 0; }
+h3 { font-size: 1rem; margin: 1.6rem 0 0; }
+figcaption, .small { color: #555; font-size: .9rem; margin: .2rem 0; }
+.wide { overflow-x: auto; margin: .6rem 0 1.2rem; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .9rem .25rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid #ddd; }
 th { border-bottom: 1px solid #1b1b1b; }
-td:first-child { min-width: 11rem; }
-.kept { color: #0b6e4f; white-space: nowrap; }
-.missed { color: #b3261e; white-space: nowrap; font-weight: 600; }
+td { white-space: nowrap; }
+td:first-child { white-space: normal; min-width: 11rem; }
+.kept { color: #0b6e4f; }
+.missed { color: #b3261e; font-weight: 600; }
 summary { cursor: pointer; }
 @media print {
   body { font-size: 10pt; max-width: none; padding: 0; }
   figure, tr { break-inside: avoid; }
   .wide { overflow: visible; }
+  td { white-space: normal; }
   img { min-width: 0; }
 }
 """
@@ -63,10 +64,9 @@ def _overview(documents: Sequence[dict[str, Any]]) -> str:
         verdict = _mark(kept == len(limited), f"{kept} of {len(limited)}") if limited else ""
         link = f'<a href="#{escape(document["experiment"])}">{escape(document["title"])}</a>'
         length = "quick" if document["quick"] else "full"
-        rows.append(
-            (link, verdict, length, f"{document['seconds']:.0f} s", escape(document["date"][:16].replace("T", " ")))
-        )
-    return _table("", ("experiment", "numbers within their limits", "run", "time", "date"), rows)
+        date = escape(document["date"][:16].replace("T", " "))
+        rows.append((link, verdict, length, f"{document['seconds']:.0f} s", date))
+    return _table(("experiment", "numbers within their limits", "run", "time", "date"), rows)
 
 
 def _section(document: dict[str, Any], folder: Path) -> str:
@@ -92,10 +92,8 @@ def _picture(path: Path, caption: str) -> str:
 
 
 def _words(table: dict[str, Any]) -> str:
-    caption = f"<b>{escape(table['title'])}</b>{escape(table['note'])}"
-    return _table(
-        caption, [escape(name) for name in table["header"]], [map(escape, map(str, row)) for row in table["rows"]]
-    )
+    head = f'<h3>{escape(table["title"])}</h3><p class="small">{escape(table["note"])}</p>'
+    return head + _table(map(escape, table["header"]), [map(escape, map(str, row)) for row in table["rows"]])
 
 
 def _numbers(records: Sequence[dict[str, Any]]) -> str:
@@ -103,10 +101,10 @@ def _numbers(records: Sequence[dict[str, Any]]) -> str:
     header = ("number", "ours", "paper", "limit", "")
     compared = [record for record in records if "tolerance" in record or "paper" in record]
     others = [record for record in records if record not in compared]
-    shown = _table("<b>Our numbers beside the paper's</b>", header, map(_number, compared)) if compared else ""
+    shown = f"<h3>Our numbers beside the paper's</h3>{_table(header, map(_number, compared))}" if compared else ""
     if not others:
         return shown
-    folded = _table("", header[:2], [_number(record)[:2] for record in others])
+    folded = _table(header[:2], [_number(record)[:2] for record in others])
     return f"{shown}<details><summary>{len(others)} more numbers</summary>{folded}</details>"
 
 
@@ -125,9 +123,8 @@ def _mark(kept: bool, text: str) -> str:
     return f'<span class="{"kept" if kept else "missed"}">{"✓" if kept else "✗"} {text}</span>'
 
 
-def _table(caption: str, header: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
-    """Cells and caption are HTML already."""
+def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Cells are HTML already."""
     head = "".join(f"<th>{name}</th>" for name in header)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    title = f"<caption>{caption}</caption>" if caption else ""
-    return f'<div class="wide"><table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
