@@ -91,6 +91,6 @@ def lights() -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    scatters(int(sys.argv[1]) if len(sys.argv) > 1 else 500)
+    scatters(int(sys.argv[1]) if len(sys.argv) > 1 else 1500)
     sequences()
     lights()
