@@ -17,8 +17,8 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # From the bottom up; a module may import what stands before it, not what stands beside or after it.
 LAYERS = [
     {"pose"},
-    {"frame", "sampling", "estimate", "calibration", "config"},
-    {"criteria"},
+    {"frame", "sampling", "estimate", "calibration", "comparison", "config", "curves"},
+    {"criteria", "synchrony"},
     {"reference"},
     {"solver"},
     {"judge", "search"},

@@ -1,0 +1,263 @@
+"""Laws of comparing two records: known offsets, angles and zeros come back, curves are exact, gaps stay gaps."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torch_ecc.comparison import Motion, check_motion, dwell_errors, nearest_errors
+from torch_ecc.curves import fit_circle, fit_ellipse, fit_line
+from torch_ecc.pose import rotation
+from torch_ecc.synchrony import Curve, Unknowns, align_records, noise
+
+OFFSET, ANGLE, LEVER = 0.337, 0.01, (800.0, -500.0)
+NEAR = Unknowns(max_offset_s=0.6)
+
+
+def ease(u: torch.Tensor) -> torch.Tensor:
+    u = u.clamp(0, 1)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def truth(t: torch.Tensor, turn: float = 0.0) -> torch.Tensor:
+    """Rest, a line to the rim, an ellipse, the line back: smooth, like a stage; ``turn`` rad there and back."""
+    out = ease((t - 0.5) / 0.5) - ease((t - 4.0) / 0.5)
+    phase = math.tau * ease((t - 1) / 3)
+    return torch.stack((12 * out * phase.cos(), 11.5 * out * phase.sin(), turn * out), -1)
+
+
+def records(nm: float = 0.0, seed: int = 0, turn: float = 0.0, lever: tuple[float, float] = (0.0, 0.0)):
+    """A track at 100 Hz of what sensors see at 1024 Hz, on another clock, along other axes, from other zeros."""
+    t, s = torch.arange(0, 4.5, 0.01).double(), torch.arange(0, 5, 1 / 1024).double()
+    m = truth(t + OFFSET, turn)
+    m[:, :2] += (rotation(m[:, 2]) - torch.eye(2)) @ torch.tensor(lever).double() - torch.tensor([3.0, -2.0])
+    m[:, :2] = m[:, :2] @ rotation(torch.tensor(ANGLE).double())
+    scatter = torch.randn(m.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return Motion(t, m + scatter * torch.tensor([1e-3, 1e-3, 1e-6]) * nm), Motion(s, truth(s, turn))
+
+
+def test_without_noise_everything_is_found():
+    found = align_records(*records(turn=0.004, lever=LEVER), Unknowns(lever=True, scale=True))
+    assert found.converged
+    assert abs(found.offset_s - OFFSET) < 1e-8
+    assert abs(found.axis_angle - ANGLE) < 1e-8
+    assert torch.allclose(found.lever, torch.tensor(LEVER).double(), atol=1e-3)
+    assert abs(found.scale - 1) < 1e-8
+    assert found.valid.sum() > 440
+    assert found.rms[:2].max() < 1e-4
+
+
+def test_the_scatter_agrees_with_the_covariance():
+    found = [align_records(*records(5.0, seed), NEAR) for seed in range(40)]
+    truth = torch.tensor([OFFSET, ANGLE], dtype=torch.float64)
+    values = torch.tensor([(f.offset_s, f.axis_angle) for f in found], dtype=torch.float64)
+    sigma = torch.stack([f.covariance.diagonal()[:2].sqrt() for f in found]).mean(0)
+    ratio = (values - truth).square().mean(0).sqrt() / sigma
+    assert ((ratio > 0.7) & (ratio < 1.35)).all(), ratio
+    rms = torch.stack([f.rms for f in found]).mean(0)
+    assert torch.allclose(rms, torch.tensor([5e-3, 5e-3, 5e-6]).double(), rtol=0.05)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(-0.2, 0.2), st.floats(-0.5, 0.5), st.floats(-50, 50))
+def test_clock_axes_and_zero_of_the_track_do_not_matter(later, turn, shift):
+    track, sensors = records(5.0)
+    pose = track.pose.clone()
+    pose[:, :2] = pose[:, :2] @ rotation(torch.tensor(turn).double()) + shift
+    moved = align_records(Motion(track.time_s + later, pose), sensors, NEAR)
+    found = align_records(track, sensors, NEAR)
+    assert moved.offset_s + later == pytest.approx(found.offset_s, abs=1e-7)
+    assert moved.axis_angle - turn == pytest.approx(found.axis_angle, abs=1e-6)
+    both = moved.valid & found.valid
+    assert torch.allclose(moved.errors[both], found.errors[both], atol=1e-6)
+
+
+def test_on_a_circle_offset_and_angle_do_the_same():
+    """And the covariance says so: without the straight parts both are hundreds of times less certain."""
+    t, s = torch.arange(0, 3, 0.01).double(), torch.arange(-1, 4, 1 / 1024).double()
+    ring = lambda u: torch.stack((12 * u.cos(), 12 * u.sin(), 0 * u), -1)  # noqa: E731
+    scatter = 5e-3 * torch.randn(300, 3, generator=torch.Generator().manual_seed(0)).double()
+    alone = align_records(Motion(t, ring(t) + scatter), Motion(s, ring(s)), Unknowns(max_offset_s=0.1))
+    whole = align_records(*records(5.0))
+    assert alone.sigma["axis_angle_rad"] > 100 * whole.sigma["axis_angle_rad"]
+    assert alone.rms[0] < 6e-3
+
+
+def test_a_record_at_rest_tells_no_offset():
+    track, sensors = records(1.0)
+    scatter = 1e-3 * torch.randn(len(track.time_s), 3, generator=torch.Generator().manual_seed(1)).double()
+    found = align_records(Motion(track.time_s, scatter), Motion(sensors.time_s, 0 * sensors.pose))
+    assert found.sigma["offset_s"] == math.inf
+    assert found.errors[found.valid].isfinite().all()
+
+
+def test_lost_frames_and_gaps_stay_in_the_result():
+    track, sensors = records(1.0)
+    track.pose[100:110] = math.nan
+    sensors.pose[2500:2600] = math.nan  # 0.1 s
+    keep = torch.ones(len(sensors.time_s), dtype=torch.bool)
+    keep[3000:3100] = False
+    found = align_records(track, Motion(sensors.time_s[keep], sensors.pose[keep]))
+    assert len(found.errors) == len(track.time_s)
+    assert abs(found.offset_s - OFFSET) < 1e-4
+    at = track.time_s + OFFSET
+    gone = (at > 2500 / 1024) & (at < 2599 / 1024) | (at > 3000 / 1024) & (at < 3099 / 1024)
+    gone[100:110] = True
+    assert (~found.valid[gone]).all()
+    assert found.valid.sum() >= (~gone).sum() - 8
+
+
+def test_exposure_is_averaged_over():
+    """Of a 20 Hz sine, an exposure T leaves sinc(f T)."""
+    t, s = torch.arange(0.1, 4, 0.01).double(), torch.arange(0, 5, 1 / 4096).double()
+    wave = lambda u: torch.stack(((20 * math.tau * u).sin(), 0 * u, 0 * u), -1)  # noqa: E731
+    value, speed, inside = Curve(Motion(s, wave(s)), 0.008)(t)
+    expected = math.sin(math.pi * 0.16) / (math.pi * 0.16)
+    assert inside.all()
+    assert torch.allclose(value, expected * wave(t), atol=2e-3)
+    assert torch.allclose(speed[:, 0], expected * 20 * math.tau * (20 * math.tau * t).cos(), atol=0.3)
+
+
+def test_the_noise_of_a_smooth_motion():
+    track, _ = records()
+    slow = track.pose / 100 + 0.02 * torch.randn(450, 3, generator=torch.Generator().manual_seed(0)).double()
+    assert torch.allclose(noise(Motion(track.time_s, slow)), torch.tensor(0.02).double(), rtol=0.1)
+
+
+def test_nearest_point_of_each_group():
+    """Brute force over ten sensor samples per frame, the records divided equally."""
+    sensors = Motion(torch.arange(400).double() / 1000, torch.randn(400, 3).double())
+    track = Motion(torch.arange(40).double() / 100 + 5.0, torch.randn(40, 3).double())
+    errors = nearest_errors(track, sensors)
+    for k in range(40):
+        group = sensors.pose[10 * k : 10 * k + 10]
+        nearest = group[(group - track.pose[k])[:, :2].norm(dim=1).argmin()]
+        assert torch.equal(errors[k], track.pose[k] - nearest)
+
+
+def test_nearest_point_with_lost_frames_and_samples():
+    sensors = Motion(torch.arange(400).double() / 1000, torch.randn(400, 3).double())
+    track = Motion(torch.arange(40).double() / 100, torch.randn(40, 3).double())
+    whole = nearest_errors(track, sensors)
+    track.pose[7] = math.nan
+    sensors.pose[200:210] = math.nan
+    keep = torch.arange(40) != 30  # a frame that is missing gives its samples to its neighbours
+    errors = nearest_errors(Motion(track.time_s[keep], track.pose[keep]), sensors)
+    assert errors.isnan().all(1).nonzero()[:, 0].tolist() == [7, 20]
+    same = [k for k in range(40) if k not in (7, 20, 29, 30, 31)]
+    assert torch.equal(errors[[k - (k > 30) for k in same]], whole[same])
+
+
+def bad_motions():
+    t, pose = torch.arange(10).double(), torch.zeros(10, 3).double()
+    swapped, broken, lost = t.clone(), t.clone(), pose.clone()
+    swapped[[4, 5]] = swapped[[5, 4]]
+    broken[3] = math.nan
+    lost[3:] = math.nan
+    return [
+        (Motion(t, pose[:, :2]), r"name: expected times \(T,\) and poses \(T, 3\), got \(10,\), \(10, 2\)"),
+        (Motion(swapped, pose), "name: times must increase, sample 5 at 4.000000 s follows 5.000000 s"),
+        (Motion(broken, pose), "name: times must be finite, sample 3 is not"),
+        (Motion(t, lost), "name: expected at least 4 samples with a finite pose, got 3 of 10"),
+    ]
+
+
+@pytest.mark.parametrize(("motion", "message"), bad_motions())
+def test_bad_records(motion, message):
+    with pytest.raises(ValueError, match=message):
+        check_motion("name", motion)
+
+
+def test_records_apart():
+    track, sensors = records()
+    with pytest.raises(ValueError, match="align: the records do not overlap, see max_offset_s"):
+        align_records(Motion(track.time_s + 100, track.pose), sensors)
+
+
+@pytest.mark.parametrize("name", ["exposure_s", "max_offset_s"])
+def test_bad_unknowns(name):
+    with pytest.raises(ValueError, match=f"{name}: expected a time >= 0 in s, got -1"):
+        Unknowns(**{name: -1.0})
+
+
+@given(st.floats(0.5, 50), st.floats(0.05, 1), st.floats(-1.5, 1.5), st.floats(-100, 100), st.floats(1.5, 6.3))
+def test_ellipse_is_exact(major, ratio, angle, shift, arc):
+    t = torch.linspace(0, arc, 60, dtype=torch.float64)
+    points = torch.stack((major * t.cos(), major * ratio * t.sin()), 1) @ rotation(torch.tensor(-angle).double()).mT
+    fit = fit_ellipse(points + shift)
+    assert torch.allclose(fit.semi_axes, torch.tensor([major, major * ratio]).double(), rtol=1e-5)
+    assert torch.allclose(fit.center, torch.full((2,), shift).double(), atol=1e-4 * major)
+    assert fit.residual_rms < 1e-6 * major
+    if ratio < 0.99:
+        assert math.sin(fit.angle - angle) == pytest.approx(0, abs=1e-3)
+
+
+@given(st.floats(0.1, 50), st.floats(-100, 100), st.floats(0.5, 6.3))
+def test_circle_is_exact(radius, shift, arc):
+    t = torch.linspace(0, arc, 40, dtype=torch.float64)
+    fit = fit_circle(radius * torch.stack((t.cos(), t.sin()), 1) + shift)
+    assert fit.radius == pytest.approx(radius, rel=1e-5)
+    assert torch.allclose(fit.center, torch.full((2,), shift).double(), atol=1e-5 * radius)
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-100, 100))
+def test_line_has_the_direction_of_travel(angle, shift):
+    t = torch.linspace(0, 5, 30, dtype=torch.float64)[:, None]
+    fit = fit_line(t * torch.tensor([math.cos(angle), math.sin(angle)]) + shift)
+    assert fit.angle == pytest.approx(angle, abs=1e-6)
+
+
+def test_sigma_of_a_line():
+    t = torch.linspace(0, 12, 100, dtype=torch.float64)
+    g = torch.Generator().manual_seed(0)
+    lines = [fit_line(torch.stack((t, 0.01 * torch.randn(100, generator=g).double()), 1)) for _ in range(200)]
+    scatter = torch.tensor([line.angle for line in lines]).std()
+    assert scatter / lines[0].sigma == pytest.approx(1, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("fit", "points", "message"),
+    [
+        (fit_line, torch.zeros(5, 2), "fit_line: points must not all lie in one place"),
+        (fit_line, torch.zeros(2, 2), "fit_line: points must be 3 or more, got 2"),
+        (fit_circle, torch.zeros(5, 3), r"fit_circle: points must be finite numbers \(N, 2\), got \(5, 3\)"),
+        (fit_circle, torch.arange(10.0)[:, None].expand(-1, 2), "fit_circle: points must not lie on one line"),
+        (
+            fit_ellipse,
+            torch.stack((torch.linspace(-2, 2, 20), torch.linspace(-2, 2, 20) ** 2), 1),
+            "fit_ellipse: points must lie around an ellipse",
+        ),
+    ],
+)
+def test_bad_points(fit, points, message):
+    with pytest.raises(ValueError, match=message):
+        fit(points)
+
+
+def test_dwells():
+    """Means, deviations and their standard errors; lost samples and what is between the dwells count nowhere."""
+    t = torch.arange(0, 30, 0.01).double()
+    level = (t // 3).clamp(max=9)[:, None] * torch.tensor([1.0, 2.0, 1e-3]).double()
+    scatter = 0.1 * torch.randn(3000, 3, generator=torch.Generator().manual_seed(0)).double()
+    pose = level + scatter
+    pose[500] = math.nan
+    starts = 3.0 * torch.arange(10).double()
+    dwells = dwell_errors(Motion(t, pose), torch.stack((starts + 0.5, starts + 3), 1))
+    assert dwells.samples.tolist() == [250, 249, *[250] * 8]
+    assert (dwells.step == -1).sum() == 501
+    expected = torch.arange(10).double()[:, None] * torch.tensor([1.0, 2.0, 1e-3]).double()
+    assert ((dwells.mean - expected).abs() < 4 * dwells.standard_error).all()
+    assert dwells.standard_error.mean() == pytest.approx(0.1 / math.sqrt(250), rel=0.05)
+    inside = dwells.step >= 0
+    assert torch.allclose(dwells.errors[inside], (pose - dwells.mean[dwells.step])[inside])
+    assert dwells.errors[~inside].isnan().all()
+
+
+def test_bad_windows():
+    motion = Motion(torch.arange(10).double(), torch.zeros(10, 3).double())
+    with pytest.raises(ValueError, match=r"windows_s must be \(K, 2\) with start < end"):
+        dwell_errors(motion, torch.tensor([[2.0, 1.0]]))
