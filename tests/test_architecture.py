@@ -24,12 +24,12 @@ LAYERS = [
     {"judge", "search"},
     {"align", "patches"},
     {"tracker"},
-    {"session", "servo"},
+    {"compare", "session", "servo"},
     {"experiments"},
     {"cli"},
 ]
 LEAVES = {"io", "plots", "sim"}  # they import nothing of the package but pose
-LEAF_USERS = {"session", "servo", "experiments", "cli"}
+LEAF_USERS = {"compare", "session", "servo", "experiments", "cli"}
 
 
 def unit(path: Path) -> str:

@@ -42,7 +42,7 @@ def figure(monkeypatch):
 
     def draw(data: Mapping[str, Any]) -> dict[str, Any]:
         kept: list[Figure] = []
-        monkeypatch.setattr(plots, "_save", lambda figure, path, dpi: kept.append(figure) or path)
+        monkeypatch.setattr(plots.track, "save", lambda figure, path, dpi: kept.append(figure) or path)
         plot_track(data, "unused.png")
         return {axes.get_ylabel(): axes for axes in kept[0].axes}
 

@@ -140,6 +140,34 @@ def _say_numbers(outcome: Any) -> None:
         console.print(text, soft_wrap=True, markup=False)
 
 
+@app.command()
+@click.argument("track")
+@click.argument("sensors")
+@click.option("--out", help="Folder for the outputs [default: torch-ecc-comparison].")
+@click.option("--template", type=int, help="Which template of the track [default: 0].")
+@click.option("--um-per-px", type=float, help="Scale of the camera, if the track has no micrometres.")
+@click.option(
+    "--axis-angle-deg", type=float, help="From the track's axes to the stage's, as far as known [default: 0]."
+)
+@click.option("--fps", type=float, help="Frames per second, if the track has no times.")
+@click.option("--flip-theta", is_flag=True, help="The sensors' theta counts the other way (a mirrored view).")
+@click.option("--scale", is_flag=True, help="Estimate a factor between the records, too.")
+@click.option("--lever", is_flag=True, help="Estimate where the template lies from the sensors' point, too.")
+@click.option("--exposure-s", type=float, help="Exposure of the camera, which averages the motion [default: 0].")
+@click.option("--max-offset-s", type=float, help="How far the two clocks may be apart [default: 2].")
+def compare(**options: Any) -> None:
+    """Compare a track.csv with other sensors' record of the same motion, at another rate and untriggered.
+
+    SENSORS is a CSV file with the columns time_s, x_um, y_um and theta_urad, theta_deg or theta_rad.
+    """
+    from torch_ecc import compare as job_of
+
+    job = build(job_of.CompareJob, {name: value for name, value in options.items() if value is not None}, "compare")
+    figures = job_of.write(job, job_of.compare(job))
+    console.print(job_of.report(figures))
+    console.print(f"In {job.out}/: comparison.json, comparison.png, errors.csv")
+
+
 def _size(text: str) -> int | list[int]:
     parts = text.lower().split("x")
     if not (1 <= len(parts) <= 2 and all(part.strip().isdecimal() for part in parts)):

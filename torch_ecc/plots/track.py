@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -16,6 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
+
+from torch_ecc.plots.save import save
 
 _Array: TypeAlias = NDArray[np.float64]
 
@@ -69,7 +70,7 @@ def plot_track(
     for name in "wr":
         axes[name].set_xlabel(data.time_label)
     _annotate(figure, data, colours, title)
-    return _save(figure, Path(path), dpi)
+    return save(figure, Path(path), dpi)
 
 
 def _load(track: str | Path | Mapping[str, ArrayLike]) -> _Track:
@@ -227,12 +228,3 @@ def _annotate(figure: Figure, data: _Track, colours: list[Any], title: str) -> N
     shades, seen = _status_colours(data.words), np.unique(data.status)
     handles = [Patch(color=shades[data.words[k]], label=data.words[k].replace("_", " ").lower()) for k in seen]
     figure.legend(handles=handles, ncols=len(handles), loc="outside lower center", frameon=False)
-
-
-def _save(figure: Figure, path: Path, dpi: int) -> Path:
-    """Under another name first: what bears the final name is whole."""
-    part = path.with_name(f"{path.name}.part")
-    part.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(part, dpi=dpi, format=path.suffix.lstrip(".") or "png")
-    os.replace(part, path)
-    return path

@@ -1,0 +1,167 @@
+"""``torch-ecc compare`` as a user meets it: files in, figures, words and pictures out, and each message."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+
+import pytest
+import torch
+from click.testing import CliRunner
+from PIL import Image
+
+from torch_ecc.cli import app
+from torch_ecc.compare import CompareJob, compare
+from torch_ecc.estimate import Estimate
+from torch_ecc.io import TrackWriter
+from torch_ecc.session import STATUS_NAMES
+
+SCALE, ANGLE, OFFSET = 0.25, 0.02, 0.1234  # um per px, rad, s
+NOISE_NM = 10.0
+
+
+def motion(t: torch.Tensor) -> torch.Tensor:
+    """A Lissajous figure of 8 um and 200 urad: (T,) s -> (T, 3) um, um, rad."""
+    parts = (8 * (2.1 * t).sin(), 6 * (3.3 * t + 0.4).sin(), 2e-4 * (1.7 * t + 1).sin())
+    return torch.stack([part - part[0] for part in parts], -1)
+
+
+def write_track(folder, micrometres: bool = True, fps: float | None = 100.0, lost: range = range(0)) -> str:
+    """Two templates; the second one follows the motion, and is lost in some frames."""
+    t = torch.arange(0, 3, 0.01).double()
+    um = motion(t + OFFSET)
+    scatter = torch.randn(300, 3, generator=torch.Generator().manual_seed(0)).double()
+    um += NOISE_NM * torch.tensor([1e-3, 1e-3, 1e-6]) * scatter / scatter.square().mean(0).sqrt()
+    turn = torch.tensor([[math.cos(ANGLE), math.sin(ANGLE)], [-math.sin(ANGLE), math.cos(ANGLE)]]).double()
+    px = torch.cat((um[:, :2] @ turn / SCALE, um[:, 2:]), 1)
+    matrix = SCALE * torch.eye(2).double() if micrometres else None
+    with TrackWriter(folder, status_names=STATUS_NAMES, fps=fps, um_matrix=matrix) as writer:
+        for k in range(300):
+            moved = torch.stack((0 * px[k], px[k]))
+            status = torch.tensor([0, 2 if k in lost else 0], dtype=torch.int8)
+            flat = torch.ones(2)
+            covariance = 1e-6 * torch.eye(3).double().expand(2, 3, 3)
+            writer.write(Estimate(moved + 300.0, moved, flat, status, flat.int(), covariance, flat))
+    return str(folder / "track.csv")
+
+
+def write_sensors(path, header="time_s,x_um,y_um,theta_urad", angle: float = 1e6, gap: range = range(0)) -> str:
+    t = torch.arange(0, 3.5, 1 / 1024).double()
+    rows = torch.cat((t[:, None], motion(t) * torch.tensor([1, 1, angle])), 1).tolist()
+    lines = [",".join(f"{v:.9g}" for v in row) for k, row in enumerate(rows) if k not in gap]
+    path.write_text("\n".join((header, *lines)) + "\n")
+    return str(path)
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, ["compare", *map(str, arguments)])
+
+
+def test_finds_what_was_put_in(tmp_path):
+    track = write_track(tmp_path, lost=range(50, 55))
+    sensors = write_sensors(tmp_path / "cds.csv", gap=range(1000, 1100))
+    out = tmp_path / "out"
+    done = run(track, sensors, "--template", 1, "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "5 frames lost by the tracker" in done.output
+    assert sorted(p.name for p in out.iterdir()) == ["comparison.json", "comparison.png", "errors.csv"]
+    figures = json.loads((out / "comparison.json").read_text())
+    offset, angle = figures["estimated"]["offset_s"], figures["estimated"]["axis_angle_rad"]
+    assert abs(offset["value"] - OFFSET) < 4 * offset["sigma"] < 2e-3
+    assert abs(angle["value"] - ANGLE) < 4 * angle["sigma"] < 2e-3
+    errors = figures["errors"]["estimated_at_once"]
+    assert errors["x_nm"]["rms"] == pytest.approx(NOISE_NM, rel=0.1)
+    assert errors["y_nm"]["rms"] == pytest.approx(NOISE_NM, rel=0.1)
+    assert figures["errors"]["nearest_points"]["x_nm"]["rms"] > 3 * NOISE_NM  # the paper's keeps the axis angle
+    with (out / "errors.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 300
+    assert [k for k, row in enumerate(rows) if row["flag"] == "lost"] == list(range(50, 55))
+    assert rows[52]["dx_nm"] == ""
+    flags = [row["flag"] for row in rows]
+    assert 9 <= flags.count("no_sensor_sample") <= 11
+    assert figures["frames"] == {word: flags.count(word) for word in ("ok", "lost", "no_sensor_sample")} | {"all": 300}
+    squares = [float(row["dx_nm"]) ** 2 for row in rows if row["flag"] == "ok"]
+    assert math.sqrt(sum(squares) / len(squares)) == pytest.approx(errors["x_nm"]["rms"], rel=1e-3)
+    assert Image.open(out / "comparison.png").size[0] > 1000
+
+
+def test_units_of_the_angle_and_of_the_track_do_not_matter(tmp_path):
+    """Degrees or microradians; micrometres in the track or a scale on the command line; times or a frame rate."""
+    with_um, plain = tmp_path / "a", tmp_path / "b"
+    first = CompareJob(write_track(with_um), write_sensors(tmp_path / "urad.csv"), template=1)
+    header = "theta_deg, y_um ,time_s,x_um"
+    t = torch.arange(0, 3.5, 1 / 1024).double()
+    x, y, theta = motion(t).unbind(1)
+    rows = torch.stack((theta.rad2deg(), y, t, x), 1).tolist()
+    (tmp_path / "deg.csv").write_text("\n".join((header, *(",".join(f"{v:.9g}" for v in r) for r in rows))))
+    track = write_track(plain, micrometres=False, fps=None)
+    second = CompareJob(track, str(tmp_path / "deg.csv"), template=1, um_per_px=SCALE, fps=100.0)
+    a, b = compare(first).alignment, compare(second).alignment
+    assert a.offset_s == pytest.approx(b.offset_s, abs=1e-7)
+    assert torch.allclose(a.errors[a.valid], b.errors[a.valid], atol=2e-6)
+
+
+def test_the_axis_angle_that_was_found_takes_itself_away(tmp_path):
+    job = CompareJob(write_track(tmp_path), write_sensors(tmp_path / "cds.csv"), template=1)
+    found = compare(job).alignment
+    again = compare(CompareJob(job.track, job.sensors, template=1, axis_angle_deg=math.degrees(found.axis_angle)))
+    assert again.alignment.axis_angle == pytest.approx(0, abs=1e-7)
+    rms = again.nearest[again.alignment.valid].square().mean(0).sqrt()
+    assert rms[:2].max() < 5e-2  # um: half the way between two sensor samples, no angle any more
+
+
+def test_opposite_angles_are_reported(tmp_path):
+    track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv", angle=-1e6)
+    assert "theta runs in opposite directions" in run(track, sensors, "--template", 1, "--out", tmp_path / "o").output
+    done = run(track, sensors, "--template", 1, "--flip-theta", "--out", tmp_path / "o")
+    assert "opposite directions" not in done.output
+    figures = json.loads((tmp_path / "o" / "comparison.json").read_text())
+    assert figures["errors"]["estimated_at_once"]["theta_urad"]["rms"] == pytest.approx(NOISE_NM, rel=0.1)
+
+
+HEAD = "time_s,x_um,y_um,theta_urad\n"
+BAD_SENSORS = {
+    "columns": ("t,x,y,theta_urad\n0,1,2,3\n", "column time_s is missing; columns found: t, x, y, theta_urad"),
+    "semicolons": ("time_s;x_um\n1;2\n", "columns found: time_s;x_um"),
+    "no angle": ("time_s,x_um,y_um\n0,1,2\n", "expected one column of theta_rad, theta_urad, theta_deg"),
+    "word": (HEAD + "0,1,2,3\n1,one,2,3\n", "line 3, column x_um: expected a number, got 'one'"),
+    "unsorted": (HEAD + "0,1,2,3\n2,1,2,3\n1,1,2,3\n", "line 4: time_s must increase, 1 follows 2"),
+    "no time": (HEAD + "0,1,2,3\n,1,2,3\n", "line 3: time_s must be a finite number"),
+    "short row": (HEAD + "0,1,2,3\n1,1,2\n", "line 3 must have 4 cells, got 3"),
+    "header only": (HEAD, "expected a header and rows of numbers, got 4 columns without a row"),
+    "empty": ("", "expected a header and rows of numbers, got 0 columns"),
+    "no poses": (HEAD + "0,,,\n1,,,\n2,,,\n3,,,\n", "sensors: expected at least 4 samples with a finite pose, got 0"),
+    "apart": (HEAD + "".join(f"{1000 + k},{k},2,3\n" for k in range(9)), "the records do not overlap"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SENSORS)
+def test_bad_sensor_files(case, tmp_path):
+    text, message = BAD_SENSORS[case]
+    (tmp_path / "cds.csv").write_text(text)
+    done = run(write_track(tmp_path), tmp_path / "cds.csv", "--out", tmp_path / "out", "--template", 1)
+    assert isinstance(done.exception, ValueError)
+    assert message in str(done.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_jobs(tmp_path):
+    track, plain = write_track(tmp_path / "a"), write_track(tmp_path / "b", micrometres=False, fps=None)
+    sensors = write_sensors(tmp_path / "cds.csv")
+    cases = {
+        "has the templates 0, 1, got 5": {"track": track, "template": 5},
+        "um_per_px: .* has no columns dx_um and dy_um": {"track": plain},
+        "fps: .* has no column time_s": {"track": plain, "um_per_px": 0.2},
+        "fps: expected a rate > 0 in Hz, got 0": {"track": track, "fps": 0.0},
+        "um_per_px: expected one or two finite numbers": {"track": track, "um_per_px": 0.0},
+        "max_offset_s: expected a time >= 0": {"track": track, "max_offset_s": -1.0},
+        "compare: out_dir must be a folder": {"track": track, "out": sensors},
+        "column template is missing": {"track": sensors},
+    }
+    for message, settings in cases.items():
+        with pytest.raises(ValueError, match=message):
+            compare(CompareJob(sensors=sensors, **settings))
+    with pytest.raises(FileNotFoundError, match=r"no such file: nowhere\.csv"):
+        compare(CompareJob(track, "nowhere.csv"))

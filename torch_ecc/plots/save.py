@@ -1,0 +1,17 @@
+"""Figures to files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+
+def save(figure: Figure, path: Path, dpi: int) -> Path:
+    """Under another name first: what bears the final name is whole."""
+    part = path.with_name(f"{path.name}.part")
+    part.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(part, dpi=dpi, format=path.suffix.lstrip(".") or "png")
+    os.replace(part, path)
+    return path
