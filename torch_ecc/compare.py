@@ -170,12 +170,12 @@ def report(figures: dict[str, Any]) -> str:
         "sensor samples without a pose": figures["sensor_samples_lost"],
     }
     lines += [f"  {count} {words}" for words, count in left.items() if count]
-    lines.append(f"{'errors, rms (largest)':<22}" + "".join(f"{name.replace('_', ' '):>20}" for name in UNITS))
+    lines.append(f"{'errors, rms (largest)':<22}" + "".join(f"{name.replace('_', ' '):>18}" for name in UNITS))
     for method, sizes in figures["errors"].items():
         cells = (f"{size['rms']:.3g} ({size['largest']:.3g})" for size in sizes.values())
-        lines.append(f"{method.replace('_', ' '):<22}" + "".join(f"{cell:>20}" for cell in cells))
+        lines.append(f"{method.replace('_', ' '):<22}" + "".join(f"{cell:>18}" for cell in cells))
     for name, item in figures["estimated"].items():
-        lines.append(f"{name:<22}{item['value']:>20.7g} +- {item['sigma']:.2g}")
+        lines.append(f"{name:<22}{item['value']:>18.7g} +- {item['sigma']:.2g}")
     if figures["theta_opposed"]:
         lines.append("theta runs in opposite directions in the two records: see --flip-theta")
     if not figures["converged"]:
