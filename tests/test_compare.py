@@ -112,6 +112,16 @@ def test_the_axis_angle_that_was_found_takes_itself_away(tmp_path):
     assert rms[:2].max() < 5e-2  # um: half the way between two sensor samples, no angle any more
 
 
+def test_what_is_estimated_is_up_to_the_user(tmp_path):
+    options = ("--scale", "--lever", "--fixed-angle", "--axis-angle-deg", math.degrees(ANGLE), "--max-offset-s", 0.3)
+    track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv")
+    assert run(track, sensors, "--template", 1, *options, "--out", tmp_path / "o").exit_code == 0
+    found = json.loads((tmp_path / "o" / "comparison.json").read_text())["estimated"]
+    assert "axis_angle_rad" not in found
+    assert abs(found["scale"]["value"] - 1) < 4 * found["scale"]["sigma"]
+    assert abs(found["lever_x_um"]["value"]) < 4 * found["lever_x_um"]["sigma"]
+
+
 def test_opposite_angles_are_reported(tmp_path):
     track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv", angle=-1e6)
     assert "theta runs in opposite directions" in run(track, sensors, "--template", 1, "--out", tmp_path / "o").output

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from torch_ecc.comparison import Motion, check_motion, dwell_errors, nearest_errors
 from torch_ecc.curves import fit_circle, fit_ellipse, fit_line
 from torch_ecc.pose import rotation
-from torch_ecc.synchrony import Curve, Unknowns, align_records, noise
+from torch_ecc.synchrony import Curve, Unknowns, align_records, noise, spline_slopes
 
 OFFSET, ANGLE, LEVER = 0.337, 0.01, (800.0, -500.0)
-NEAR = Unknowns(max_offset_s=0.6)
+NEAR = Unknowns(max_offset_s=0.4)
 
 
 def ease(u: torch.Tensor) -> torch.Tensor:
@@ -52,18 +52,18 @@ def test_without_noise_everything_is_found():
 
 
 def test_the_scatter_agrees_with_the_covariance():
-    found = [align_records(*records(5.0, seed), NEAR) for seed in range(40)]
+    found = [align_records(*records(5.0, seed), NEAR) for seed in range(24)]
     truth = torch.tensor([OFFSET, ANGLE], dtype=torch.float64)
     values = torch.tensor([(f.offset_s, f.axis_angle) for f in found], dtype=torch.float64)
     sigma = torch.stack([f.covariance.diagonal()[:2].sqrt() for f in found]).mean(0)
     ratio = (values - truth).square().mean(0).sqrt() / sigma
-    assert ((ratio > 0.7) & (ratio < 1.35)).all(), ratio
+    assert ((ratio > 0.65) & (ratio < 1.4)).all(), ratio
     rms = torch.stack([f.rms for f in found]).mean(0)
     assert torch.allclose(rms, torch.tensor([5e-3, 5e-3, 5e-6]).double(), rtol=0.05)
 
 
-@settings(max_examples=10, deadline=None)
-@given(st.floats(-0.2, 0.2), st.floats(-0.5, 0.5), st.floats(-50, 50))
+@settings(max_examples=6, deadline=None)
+@given(st.floats(-0.05, 0.05), st.floats(-0.5, 0.5), st.floats(-50, 50))
 def test_clock_axes_and_zero_of_the_track_do_not_matter(later, turn, shift):
     track, sensors = records(5.0)
     pose = track.pose.clone()
@@ -93,6 +93,37 @@ def test_a_record_at_rest_tells_no_offset():
     found = align_records(Motion(track.time_s, scatter), Motion(sensors.time_s, 0 * sensors.pose))
     assert found.sigma["offset_s"] == math.inf
     assert found.errors[found.valid].isfinite().all()
+
+
+def test_ringing_does_not_mislead_the_clock():
+    """Steps that ring at 240 Hz: one period off, 4.2 ms, fits nearly as well, and a lever arm moves x and y along."""
+    lever = torch.tensor([1500.0, -1000.0]).double()
+    t, s = torch.arange(0.2137, 3, 0.01).double(), torch.arange(0, 3, 1 / 1024).double()
+
+    def stairs(u: torch.Tensor) -> torch.Tensor:
+        since = u[:, None] - torch.arange(0.4, 2.9, 0.2413).double()
+        rung = 1 - (-45 * since).exp() * (math.tau * 240 * since).cos()
+        up_and_down = 7e-4 * torch.where(torch.arange(since.shape[1]) < 5, 1.0, -1.0)
+        theta = torch.where(since > 0, rung, 0.0) @ up_and_down.double()
+        return torch.stack((0 * theta, 0 * theta, theta), 1)
+
+    seen = stairs(t)
+    seen[:, :2] = (rotation(seen[:, 2]) - torch.eye(2)) @ lever
+    seen += torch.tensor([0.02, 0.02, 5e-5]) * torch.randn(seen.shape, generator=torch.Generator().manual_seed(0))
+    unknowns = Unknowns(angle=False, lever=True, max_offset_s=0.5)
+    found = align_records(Motion(t - t[0], seen), Motion(s, stairs(s)), unknowns)
+    assert "axis_angle_rad" not in found.names
+    assert found.axis_angle == 0
+    assert found.offset_s == pytest.approx(0.2137, abs=2e-4)
+    assert ((found.lever - lever).abs() < 20).all()
+
+
+def test_the_spline_is_exact_on_cubics():
+    """At uneven times; what its ends do not know fades inwards."""
+    gaps = 0.5 + torch.rand(80, generator=torch.Generator().manual_seed(0)).double()
+    t = gaps.cumsum(0) / 80
+    slopes = spline_slopes(t, torch.stack((t**3, 1 + t - 2 * t**2), 1))
+    assert torch.allclose(slopes[20:-20], torch.stack((3 * t**2, 1 - 4 * t), 1)[20:-20], atol=1e-7)
 
 
 def test_lost_frames_and_gaps_stay_in_the_result():

@@ -151,6 +151,9 @@ def _say_numbers(outcome: Any) -> None:
 )
 @click.option("--fps", type=float, help="Frames per second, if the track has no times.")
 @click.option("--flip-theta", is_flag=True, help="The sensors' theta counts the other way (a mirrored view).")
+@click.option(
+    "--fixed-angle", is_flag=True, help="Take the axis angle as given (needed with --lever if only theta moves)."
+)
 @click.option("--scale", is_flag=True, help="Estimate a factor between the records, too.")
 @click.option("--lever", is_flag=True, help="Estimate where the template lies from the sensors' point, too.")
 @click.option("--exposure-s", type=float, help="Exposure of the camera, which averages the motion [default: 0].")

@@ -30,7 +30,8 @@ class CompareJob:
 
     ``track``: a track.csv; ``sensors``: a CSV with time_s, x_um, y_um and theta_urad, theta_deg or theta_rad.
     ``um_per_px`` and ``fps`` are needed where the track has no micrometres or no times. ``flip_theta``: the sensors'
-    theta counts the other way (a mirrored view). The last four as in ``synchrony.Unknowns``.
+    theta counts the other way (a mirrored view). ``fixed_angle``: ``axis_angle_deg`` is known and not estimated. The
+    last four as in ``synchrony.Unknowns``.
     """
 
     track: str
@@ -41,6 +42,7 @@ class CompareJob:
     axis_angle_deg: float = 0.0
     fps: float | None = None
     flip_theta: bool = False
+    fixed_angle: bool = False
     scale: bool = False
     lever: bool = False
     exposure_s: float = 0.0
@@ -69,7 +71,13 @@ class Comparison(NamedTuple):
 def compare(job: CompareJob) -> Comparison:
     """Read both files and compare them. FileNotFoundError or ValueError for whatever does not fit."""
     check_folder(job.out, "compare")
-    unknowns = Unknowns(job.scale, job.lever, job.exposure_s, job.max_offset_s)
+    unknowns = Unknowns(
+        angle=not job.fixed_angle,
+        scale=job.scale,
+        lever=job.lever,
+        exposure_s=job.exposure_s,
+        max_offset_s=job.max_offset_s,
+    )
     table, (time, pose) = read_track(job.track, job.template), read_sensors(job.sensors)
     track, sensors = to_motion(table, job), Motion(torch.from_numpy(time), torch.from_numpy(pose))
     alignment = align_records(track, sensors, unknowns)

@@ -18,19 +18,23 @@ from torch_ecc.pose import rotation
 
 INSTANTS = 8  # of one exposure, over which the dense record is averaged
 GAP = 3.0  # median periods without a sample that are not interpolated over
-POINTS, LAGS = 1000, 8000  # frames and offsets tried in the search for the offset, at most
+POINTS, LAGS = 1000, 8000  # frames and offsets tried in the first search for the offset, at most
+PASSES = 40  # of Jacobi for the spline: 1e-12
+CHUNK = 64_000  # interpolated poses at once
+NAMES = ("offset_s", "axis_angle_rad", "x0_um", "y0_um", "theta0_rad", "scale", "lever_x_um", "lever_y_um")
 FLOOR = (1e-6, 1e-6, 1e-9)  # um, um, rad: below this a record is exact
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Unknowns:
-    """What stands between the records, besides the time offset, the axis angle and the three zeros.
+    """What stands between the records, besides the time offset and the three zeros.
 
-    ``scale``: a factor of the track's x and y. ``lever``: the template lies away from the point whose x and y the
-    sensors give. ``exposure_s``: the camera averages the motion over it. ``max_offset_s``: how far the clocks may be
-    apart.
+    ``angle``: between the axes of image and stage; where theta alone moves, a lever arm does the same. ``scale``: a
+    factor of the track's x and y. ``lever``: the template lies away from the point whose x and y the sensors give.
+    ``exposure_s``: the camera averages the motion over it. ``max_offset_s``: how far the clocks may be apart.
     """
 
+    angle: bool = True
     scale: bool = False
     lever: bool = False
     exposure_s: float = 0.0
@@ -45,8 +49,12 @@ class Unknowns:
     @property
     def names(self) -> tuple[str, ...]:
         """The parameters in their order."""
-        first = ("offset_s", "axis_angle_rad", "x0_um", "y0_um", "theta0_rad")
-        return first + ("scale",) * self.scale + ("lever_x_um", "lever_y_um") * self.lever
+        return tuple(name for name, free in zip(NAMES, self.free, strict=True) if free)
+
+    @property
+    def free(self) -> tuple[bool, ...]:
+        """Which of all parameters are estimated."""
+        return (True, self.angle, True, True, True, self.scale, self.lever, self.lever)
 
 
 class Alignment(NamedTuple):
@@ -89,7 +97,7 @@ class Alignment(NamedTuple):
 def align_records(track: Motion, sensors: Motion, unknowns: Unknowns | None = None) -> Alignment:
     """Time offset, axis angle, zeros (and scale, lever arm) by least squares on both whole records.
 
-    The sensors' record s is interpolated by cubic Hermite pieces and averaged over the exposure. Then
+    The sensors' record s is interpolated by a cubic spline and averaged over the exposure. Then
 
         error(t) = scale R(axis_angle) m(t) + zero - s(t + offset) - (R(s_theta) - 1) lever
 
@@ -119,7 +127,7 @@ def align_records(track: Motion, sensors: Motion, unknowns: Unknowns | None = No
 
 
 class Curve:
-    """A record between its samples: cubic Hermite pieces with three-point slopes, undefined in its gaps.
+    """A record between its samples: a cubic spline, undefined in its gaps.
 
     ``exposure_s``: values are means over this time around the instant.
     """
@@ -127,8 +135,9 @@ class Curve:
     def __init__(self, motion: Motion, exposure_s: float = 0.0) -> None:
         good = motion.pose.isfinite().all(1)
         self.time, self.pose = motion.time_s[good].contiguous(), motion.pose[good]
-        self.slope = torch.gradient(self.pose, spacing=(self.time,), dim=0, edge_order=1)[0]
-        self.gap = GAP * motion.period_s
+        self.slope = spline_slopes(self.time, self.pose)
+        self.period_s = motion.period_s
+        self.gap = GAP * self.period_s
         count = INSTANTS if exposure_s > 0 else 1
         self.instants = exposure_s * ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5)
 
@@ -147,6 +156,21 @@ class Curve:
         return value.mean(-2), speed.mean(-2), inside.all(-1)
 
 
+def spline_slopes(time: Tensor, values: Tensor) -> Tensor:
+    """Slopes (T, C) of the cubic spline through values (T, C) at uneven times (T,), whose second derivative is steady.
+
+    The tridiagonal equations are diagonally dominant by 2, so that every pass of Jacobi halves the error.
+    """
+    h = time.diff()[:, None]
+    rise = values.diff(dim=0) / h
+    slope = torch.gradient(values, spacing=(time,), dim=0, edge_order=1)[0]
+    before, after = h[:-1], h[1:]
+    right = 3 * (after * rise[:-1] + before * rise[1:])
+    for _ in range(PASSES):
+        slope[1:-1] = (right - after * slope[:-2] - before * slope[2:]) / (2 * (before + after))
+    return slope
+
+
 def noise(motion: Motion) -> Tensor:
     """Standard deviation (3,) of white noise on a smooth motion, from the median size of its second differences."""
     second = motion.pose.diff(n=2, dim=0)
@@ -162,7 +186,7 @@ class _Model:
     def __init__(self, track: Motion, curve: Curve, unknowns: Unknowns) -> None:
         self.track, self.curve, self.unknowns, self.names = track, curve, unknowns, unknowns.names
         self.good = track.pose.isfinite().all(1)
-        self.free = [0, 1, 2, 3, 4] + [5] * unknowns.scale + [6, 7] * unknowns.lever
+        self.free = [k for k, free in enumerate(unknowns.free) if free]
 
     def __call__(self, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Residuals (V, 3), Jacobian (V, 3, P) and the frames (T,) that have both records."""
@@ -186,14 +210,21 @@ class _Model:
         return residual, jacobian[:, :, self.free], valid
 
     def search(self) -> float:
-        """The offset on a grid of a quarter of a frame whose records are most alike at any angle between them."""
-        reach = self.unknowns.max_offset_s
-        count = min(2 * math.ceil(4 * reach / self.track.period_s) + 1, LAGS)
-        lags = torch.linspace(-reach, reach, count, dtype=torch.float64) if reach > 0 else torch.zeros(1).double()
-        every = -(-int(self.good.sum()) // POINTS)
-        time, m = self.track.time_s[self.good][::every], self.track.pose[self.good][::every]
-        weight = 1 / noise(self.track)
-        found = [self._unlikeness(time, m, some, weight) for some in lags.split(64)]
+        """The offset at which the records are most alike at any angle between them.
+
+        On a grid of a quarter of a frame first, then to a sample of the sensors: ringing has minima of its own.
+        """
+        reach, good = self.unknowns.max_offset_s, self.good
+        time, m = self.track.time_s[good], self.track.pose[good]
+        every = -(-len(time) // POINTS)
+        best = self._best(time[::every], m[::every], _grid(reach, self.track.period_s / 4))
+        near = min(2 * self.track.period_s, reach)
+        return self._best(time, m, best + _grid(near, self.curve.period_s))
+
+    def _best(self, time: Tensor, m: Tensor, lags: Tensor) -> float:
+        """The offset among ``lags`` (J,) of least unlikeness where at least half as many frames count as anywhere."""
+        weight, chunk = 1 / noise(self.track), max(1, CHUNK // len(time))
+        found = [self._unlikeness(time, m, some, weight) for some in lags.split(chunk)]
         cost, frames = (torch.cat(part) for part in zip(*found, strict=True))
         if int(frames.max()) < 4:
             raise ValueError("align: the records do not overlap, see max_offset_s and the units of time")
@@ -205,11 +236,30 @@ class _Model:
         share = inside.double() / inside.sum(1, keepdim=True).clamp(min=1)
         s = s - (share[..., None] * s).sum(1, keepdim=True)
         m = m - (share[..., None] * m).sum(1, keepdim=True)
-        z, w = torch.complex(m[..., 0], m[..., 1]), torch.complex(s[..., 0], s[..., 1])
-        alike = 2 * (share * z * w.conj()).sum(1).abs()
+        if self.unknowns.lever:  # whatever goes along with theta may be the lever's
+            z, w = (_without(v[..., :2], s[..., 2:], share[..., None]) for v in (m, s))
+        else:
+            z, w = m[..., :2], s[..., :2]
+        z, w = (torch.complex(v[..., 0], v[..., 1]) for v in (z, w))
+        product = (share * z * w.conj()).sum(1)
+        alike = 2 * (product.abs() if self.unknowns.angle else product.real)
         plane = (share * (z.abs().square() + w.abs().square())).sum(1) - alike
         turn = (share * (m[..., 2] - s[..., 2]).square()).sum(1)
         return plane * weight[:2].square().mean() + turn * weight[2].square(), inside.sum(1)
+
+
+def _grid(reach: float, step: float) -> Tensor:
+    """Offsets from -reach to reach about ``step`` apart, at most ``LAGS``; one at 0 for no reach."""
+    count = min(2 * math.ceil(reach / step) + 1, LAGS)
+    return torch.linspace(-reach, reach, count, dtype=torch.float64) if reach > 0 else torch.zeros(1).double()
+
+
+def _without(values: Tensor, along: Tensor, share: Tensor) -> Tensor:
+    """Centred ``values`` (J, T, 2) without their part along (J, T, 1), frames weighted by ``share`` (J, T, 1)."""
+    part = (share * along * values).sum(1, keepdim=True) / (share * along.square()).sum(1, keepdim=True).clamp(
+        min=1e-30
+    )
+    return values - part * along
 
 
 def _solve(residual: Tensor, jacobian: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
