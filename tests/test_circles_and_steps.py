@@ -1,0 +1,119 @@
+"""Figs. 6 to 11 in their short versions: what they have to show, and that pictures, tables and records are whole."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torch_ecc.comparison import Motion
+from torch_ecc.experiments import circles, fig6, fig7, fig8, fig9, fig10, fig11, steps
+from torch_ecc.experiments.acquisition import Bench, acquire, ease, zeroed
+from torch_ecc.sim.micrograph import micrograph
+from torch_ecc.sim.microscope import Microscope
+from torch_ecc.sim.window import Window
+
+MODULES = (fig6, fig7, fig8, fig9, fig10, fig11)
+
+
+@pytest.fixture(scope="module")
+def outcomes():
+    """All six, simulated twice only: once for the circles, once for the steps."""
+    calls: list[tuple[int, int]] = []
+    found = [module.run(True, lambda done, total: calls.append((done, total))) for module in MODULES]
+    assert all(0 < done <= total for done, total in calls)
+    assert len(calls) < 1600  # one call per frame, and no frame twice
+    return dict(zip((m.__name__.rsplit(".", 1)[1] for m in MODULES), found, strict=True))
+
+
+@pytest.mark.parametrize("name", ["fig6", "fig7", "fig8", "fig9", "fig10", "fig11"])
+def test_every_limit_is_kept(outcomes, name):
+    outcome = outcomes[name]
+    assert outcome.name == name
+    assert [record for record in outcome.records if not record.kept] == []
+    assert any(record.tolerance is not None for record in outcome.records)
+    assert len(outcome.pictures) == 1
+    assert outcome.pictures[0].figure.axes
+    for table in outcome.tables:
+        assert {len(row) for row in table.rows} == {len(table.header)}
+        assert "nan" not in " ".join(cell for row in table.rows for cell in row)
+
+
+def test_the_joint_estimate_keeps_what_the_nearest_points_absorb(outcomes):
+    """Known clock and angle leave no less; tracker, lens and sensors together make up the whole."""
+    for r in circles.rounds(True, lambda done, total: None):
+        assert torch.allclose(r.joint.rms, r.known, rtol=0.05)
+        parts = (r.tracker.square() + r.lens.square() + r.cds.square()).sqrt()
+        assert torch.allclose(r.known, parts, rtol=0.1)
+        assert abs(r.joint.offset_s - r.acquired.offset_s) < 4 * r.joint.sigma["offset_s"]
+
+
+def test_parasitic_translation_is_the_lever_arm_times_the_angle(outcomes):
+    found = steps.staircase(True, lambda done, total: None)
+    left, sigma = fig9.deviations(found)
+    assert (left.abs() < 4 * sigma).all()
+    assert left.square().mean().sqrt() < 0.02  # um, of up to 5
+    arm = torch.tensor(steps.VIEW_UM).double()
+    spread = torch.tensor([found.alignment.sigma[k] for k in ("lever_x_um", "lever_y_um")])
+    assert ((found.alignment.lever - arm).abs() < 3 * spread).all()
+
+
+def test_commands():
+    path = circles.command(8.0, 5.0)
+    assert path[:, :2].norm(dim=1).max() == pytest.approx(8.0)
+    assert torch.equal(path[0], path[-1])
+    assert path.diff(dim=0).norm(dim=1).max() < 0.1  # um per ms: no jumps
+    stairs = steps.command(0.4)[:, 2].rad2deg()
+    assert stairs.max() == pytest.approx(0.24)
+    assert stairs.diff().abs().max() == pytest.approx(0.04)
+    assert stairs[-1] == 0
+    u = torch.linspace(-1, 2, 301)
+    assert ease(u)[0] == 0
+    assert ease(u)[-1] == 1
+    assert (ease(u).diff() >= 0).all()
+
+
+def test_portions_of_a_made_up_record():
+    """Out, three quarters of a circle, back, seen by both: the angle between their axes comes back."""
+    t = torch.linspace(0, 10, 1000, dtype=torch.float64)
+    path = circles.command(10.0, 10.0)[:: len(circles.command(10.0, 10.0)) // 1000][:1000]
+    sensors = Motion(t, path)
+    turned = path.clone()
+    c, s = math.cos(0.01), math.sin(0.01)
+    turned[:, 0], turned[:, 1] = c * path[:, 0] - s * path[:, 1], s * path[:, 0] + c * path[:, 1]
+    assert circles.line_angle(Motion(t, turned), sensors) == pytest.approx(0.01, abs=1e-9)
+    rim = circles.circular(sensors)
+    assert path[rim, :2].norm(dim=1).min() > 8.9
+    assert not rim[0]
+    assert not rim[-1]
+
+
+def test_a_window_shows_the_same_scene():
+    """Around the pose as in the whole frame, darkness elsewhere, also at a border."""
+    scene = micrograph()
+    window = Window(scene, (61, 81))
+    poses = torch.tensor([[60.3, 50.7, 0.2], [5.0, 95.0, 0.0]], dtype=torch.float64)
+    whole, part = scene.render(poses, (100, 120)), window.render(poses, (100, 120))
+    seen = part != 0
+    assert seen.sum((1, 2, 3)).tolist() == [61 * 81, 61 * 81]
+    assert torch.allclose(part[seen], whole[seen], atol=1e-3)
+    assert seen[0, 0, 51, 60]
+    with pytest.raises(ValueError, match="Window: size must be"):
+        Window(scene, (0, 5))
+
+
+def test_an_acquisition_says_what_is_lost_and_where_zero_is():
+    path = torch.zeros(700, 3, dtype=torch.float64)
+    path[:, 0] = 2 * ease(torch.linspace(-1, 1.5, 700))
+    got = acquire(path, Bench(microscope=Microscope(region_px=(200, 220), exposure_s=0.0)), lambda: None)
+    frames = len(got.truth.time_s)
+    assert frames == got.tracks["ECC"].pose.shape[0] == got.sigma["ECC"].shape[0]
+    error = (got.tracks["ECC"].pose - got.truth.pose)[:, :2].abs()
+    assert error.max() < 5e-3  # um
+    assert set(got.seconds) == {"stage", "sensors", "frames", "tracking, ECC"}
+    track = got.tracks["ECC"]
+    track.pose[3] = math.nan
+    rest = zeroed(track, 0.1)
+    assert rest.pose[:10].nanmean(0).abs().max() < 1e-9
+    assert rest.pose[3].isnan().all()
