@@ -54,9 +54,9 @@ def test_parasitic_translation_is_the_lever_arm_times_the_angle(outcomes):
     left, sigma = fig9.deviations(found)
     assert (left.abs() < 4 * sigma).all()
     assert left.square().mean().sqrt() < 0.02  # um, of up to 5
-    arm = torch.tensor(steps.VIEW_UM).double()
-    spread = torch.tensor([found.alignment.sigma[k] for k in ("lever_x_um", "lever_y_um")])
-    assert ((found.alignment.lever - arm).abs() < 3 * spread).all()
+    lever, spread = fig9.lever_arm(found)
+    assert ((lever - torch.tensor(steps.VIEW_UM).double()).abs() < 3 * spread).all()
+    assert (spread < 15).all()
 
 
 def test_commands():

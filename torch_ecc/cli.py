@@ -167,7 +167,7 @@ def compare(**options: Any) -> None:
 
     job = build(job_of.CompareJob, {name: value for name, value in options.items() if value is not None}, "compare")
     figures = job_of.write(job, job_of.compare(job))
-    console.print(job_of.report(figures))
+    console.print(job_of.report(figures), markup=False)
     console.print(f"In {job.out}/: comparison.json, comparison.png, errors.csv")
 
 

@@ -29,7 +29,8 @@ SIZE = 121  # px, the paper's template
 AROUND = 16  # px drawn around it: all that a tracker reads
 COMMAND_HZ = 1000.0
 QUIET = Floor(speed_um_s=0.78)  # VC-G: an isolated table (Amick et al., SPIE 5933, 2005)
-ON_TABLE: Mapping[str, Any] = {"floor": QUIET, "exposure_s": 0.0}  # a strobe: 2 ms of light would smear 0.05 um at most
+# Of the microscope: a stiff column on that table, and a strobe (2 ms of light would smear 0.05 um at most).
+ON_TABLE: Mapping[str, Any] = {"floor": QUIET, "column_hz": 90.0, "exposure_s": 0.0}
 CAMERA_START_S = 0.2137  # of the stage's clock; the sensors start with the stage
 METHODS: Mapping[str, Mapping[str, Any]] = {"ECC": {}}
 

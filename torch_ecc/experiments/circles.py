@@ -25,7 +25,7 @@ from torch_ecc.experiments.acquisition import (
 )
 from torch_ecc.experiments.result import Advance
 from torch_ecc.sim.microscope import Microscope
-from torch_ecc.synchrony import Alignment, align_records
+from torch_ecc.synchrony import Alignment, Curve, align_records
 
 RADII = (8.0, 12.0)  # um, commanded
 ZOOM = 2.0  # 0.275 um per px
@@ -98,7 +98,8 @@ def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None
     points = sensors.pose[sensed, :2]
     turn = Calibration(1.0, bench.microscope.axis_angle)
     turned, image = (turn.to_physical(m.pose) for m in (acquired.tracks["ECC"], acquired.truth))
-    real = acquired.motion.at(acquired.truth.time_s + acquired.offset_s)
+    at = acquired.truth.time_s + acquired.offset_s
+    real = acquired.motion.at(at)
     return Round(
         radius,
         bench.microscope.axis_angle,
@@ -111,7 +112,7 @@ def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None
         line_angle(track, sensors),
         fit_circle(points),
         fit_ellipse(points),
-        _scatter(turned - real),
+        _scatter(turned - Curve(acquired.sensors)(at)[0]),
         _scatter(turned - image),
         _scatter(image - real),
         _scatter(acquired.sensors.pose - acquired.motion.at(acquired.sensors.time_s)),
