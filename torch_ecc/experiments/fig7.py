@@ -18,8 +18,8 @@ REMARKS = (
     "The paper's nearest points absorb whatever lies along the path: the angle between image and stage (on a circle "
     "about the rest position it moves points along it), the clocks, and real errors alike. What is across the path "
     "remains, and the ends of the groups. The joint estimate keeps every error and takes out clock, angle and zeros.",
-    "What it leaves is the vibration of the lens on its column, which the sensors at the stage do not see, to within a "
-    "percent of what exact knowledge of clock and angle leaves. The tracker's own error is below one nanometre.",
+    "What it leaves is the vibration of the lens on its column, which the sensors at the stage do not see, and their "
+    "non-linearity: as much as exact knowledge of clock and angle leaves. The tracker's own error is below 1 nm.",
 )
 
 
