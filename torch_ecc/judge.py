@@ -35,7 +35,10 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     sampler = interpolation_error(reference, pose, settings.interpolation)
     covariance, fixed = pose_covariance(reference, noise, gain, pose, structure, sampler)
     shown = visible >= settings.min_visible
-    match = (score >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
+    alike = score
+    if bool((score < settings.min_score).any()):  # light alone must not make a stranger of the template
+        alike = torch.maximum(score, flat_correlation(reference, state.patch).to(pose.dtype))
+    match = (alike >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
     status = decide(whole, shown, match, fixed, state.error <= settings.tolerance)
     good = Status.good(status)
     pose = torch.where(good[:, None], pose, start)
@@ -64,6 +67,18 @@ def correlation(t: Tensor, g: Tensor, weight: Tensor) -> Tensor:
     norm = dt * dg
     score = (weight * t0 * g0).sum(-1) / norm.clamp(min=1e-30)
     return torch.where(norm > 1e-12 * (weight * g * g).sum(-1), score, 0.0).clamp(-1, 1)
+
+
+def flat_correlation(reference: Reference, g: Tensor) -> Tensor:
+    """Correlation (B,) of the templates and patches g (B, N) without their planes 1, x', y': unlike ``correlation``,
+    it is the same in light that varies across the template."""
+    uv = reference.uv
+    planes = torch.cat((torch.ones_like(uv[:, :1]), uv), 1)
+    weighted = planes * reference.weight[:, None]
+    inverse, _ = safe_inverse(weighted @ planes.mT)
+    both = torch.stack((reference.signal[:, 3], g - g.mean(-1, keepdim=True)), -1)
+    t, g = (both - planes.mT @ (inverse @ (weighted @ both))).unbind(-1)
+    return correlation(t, g, reference.weight)
 
 
 def noise_variance(reference: Reference, power: Tensor, gain: Tensor, sampled: float) -> Tensor:

@@ -1,0 +1,190 @@
+"""Find templates anywhere in a frame, at any angle, without a start: global search, coarse to fine (section V).
+
+The correlation with every place and turn at a coarse level (``bank``) gives candidates; Gauss-Newton brings each to its
+local best, level by level, and drops those that lead to the same pose or fall behind.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.align import solve
+from torch_ecc.bank import Bank, search_level
+from torch_ecc.estimate import Estimate, Status
+from torch_ecc.frame import as_gray
+from torch_ecc.judge import flat_correlation
+from torch_ecc.pose import unwrap
+from torch_ecc.pyramid import pyramid
+from torch_ecc.reference import Reference
+from torch_ecc.sampling import Bilinear, halve, inside
+from torch_ecc.solver import Settings, State, stage, warps
+
+LEVELS = 8  # of a pyramid at most: it ends where the template gets too small
+CANDIDATES = 32  # local maxima of the correlation that are looked at
+FINALISTS = 3  # of them, brought to the answer
+COARSE_ITERATIONS = 8
+COARSE_TOLERANCE = 0.1  # px of a coarse level
+NEIGHBOURS = 3.0  # px of the search's level at the farthest pixel: maxima nearer than that lead to one pose
+DISTINCT = 1.5  # px at the farthest pixel: nearer than that two poses are one
+LEAST_SEEN = 0.4  # of a template's weight must lie in the frame
+AS_GOOD = (1.5, 0.01)  # a runner-up is as good if what its score lacks to 1 is at most a times the best one's, plus b
+
+
+class Located(NamedTuple):
+    """Where B templates were found.
+
+    ``estimate`` (B, ...): the best pose, theta in (-pi, pi], and its status; LOST where nothing in the frame looks
+    like the template, the pose being that of what looks most like it; ``displacement`` is what the last refinement has
+    added. ``score`` (B,): correlation in [-1, 1] without the plane of light, by which candidates are ranked (the
+    estimate's own is with it). ``runner_up`` and ``runner_up_score``: the same of the best pose at another place or
+    angle; score -1 where there is none. ``ambiguous`` (B,) bool: the runner-up is as good, or the texture does not
+    fix the pose.
+    """
+
+    estimate: Estimate
+    score: Tensor
+    runner_up: Estimate
+    runner_up_score: Tensor
+    ambiguous: Tensor
+
+    @property
+    def pose(self) -> Tensor:
+        """(B, 3) px, px, rad."""
+        return self.estimate.pose
+
+    @property
+    def status(self) -> Tensor:
+        """(B,) int8, see Status."""
+        return self.estimate.status
+
+
+def locate(
+    reference: Reference,
+    image: Tensor,
+    *,
+    interpolation: str = "bspline3",
+    max_iterations: int = 15,
+    tolerance: float = 1e-3,
+    min_score: float = 0.5,
+) -> Located:
+    """Poses of B prepared templates anywhere in their images, (B or 1, 1, H, W), at any angle -> Located.
+
+    At least 0.4 of a template must lie in the frame. For many frames make a ``Locator`` once. Raises ValueError for
+    bad shapes, dtypes, devices, NaN and unknown options.
+    """
+    if not isinstance(reference, Reference):
+        raise ValueError(f"locate: reference must come from prepare, got {type(reference).__name__}")
+    settings = Settings(interpolation, max_iterations, tolerance, min_score, LEAST_SEEN)
+    gray = as_gray("locate", "image", image)
+    return Locator(reference, (gray.shape[-2], gray.shape[-1]), settings)(gray)
+
+
+class Locator:
+    """Search for B prepared templates in frames of ``size`` (h, w), prepared once.
+
+    ``settings``: of the last refinement. Raises ValueError for what is no reference and for frames smaller than 12 px.
+    """
+
+    def __init__(self, reference: Reference, size: tuple[int, int], settings: Settings | None = None) -> None:
+        self.size = size
+        self.settings = settings or Settings(min_visible=LEAST_SEEN)
+        self.pyramids, self.banks = [], []
+        device = reference.K.device
+        for b in range(len(reference.K)):
+            references = pyramid(reference.select(torch.tensor([b], device=device)), LEVELS)
+            level = search_level(references)
+            h, w = (-(-n // 2**level) for n in size)
+            self.pyramids.append(references[: level + 1])
+            self.banks.append(Bank.of(references[level], (h, w)))
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor) -> Located:
+        """The templates in ``image``, (1 or B, 1, H, W) or as the tracker takes it, of the locator's size."""
+        gray = as_gray("locate", "image", image)
+        count, device = len(self.banks), self.banks[0].turns.device
+        if gray.shape[-2:] != self.size or len(gray) not in (1, count):
+            (h, w), n = self.size, f"1 or {count}" if count > 1 else "1"
+            raise ValueError(f"locate: image must be {n} of {w}x{h} px, got {tuple(gray.shape)}")
+        if gray.device != device:
+            raise ValueError(f"locate: image must be on the reference's device {device}, got {gray.device}")
+        levels = max(map(len, self.pyramids))
+        images = halvings(gray, levels)
+        return _decide([self.candidates(images, b) for b in range(count)])
+
+    def candidates(self, images: list[Tensor], b: int) -> tuple[Estimate, Tensor]:
+        """Template ``b`` in frames given as ``halvings`` (1 or B, 1, h, w): at most FINALISTS distinct poses (K, ...) and
+        their scores (K,), the best first."""
+        references, bank = self.pyramids[b], self.banks[b]
+        images = [image if len(image) == 1 else image[b : b + 1] for image in images]
+        top = len(references) - 1
+        pose, score = bank.candidates(images[top][0, 0], CANDIDATES // 2)
+        pose = pose[distinct(pose, score, references[top].radius, NEIGHBOURS)[:CANDIDATES]]
+        for level in range(top, min(top, 1) - 1, -1):  # the last level is left to the refinement
+            pose = descend(references[level], images[level], pose, FINALISTS * max(level, 1))
+            pose = pose * pose.new_tensor((2.0, 2.0, 1.0)) if level else pose
+        pose = torch.cat((pose[:, :2], unwrap(pose[:, 2:], torch.zeros_like(pose[:, 2:]))), -1)
+        copies = _copies(references[0], len(pose))
+        estimate = solve(copies, images[0], pose, self.settings)
+        score = likeness(copies, images[0], estimate.pose)
+        kept = distinct(estimate.pose, score, references[0].radius)
+        return Estimate(*(value[kept] for value in estimate)), score[kept]
+
+
+def halvings(image: Tensor, levels: int) -> list[Tensor]:
+    """``image`` (B, 1, H, W) and its ``levels`` - 1 coarser ones."""
+    images = [image]
+    while len(images) < levels:
+        images.append(halve(images[-1]))
+    return images
+
+
+def descend(reference: Reference, image: Tensor, pose: Tensor, most: int) -> Tensor:
+    """Candidates (K, 3) of one template brought to their best nearby: the ``most`` best of them that differ."""
+    copies = _copies(reference, len(pose))
+    state = stage(copies, image, State.start(copies, pose), "bilinear", COARSE_TOLERANCE, COARSE_ITERATIONS)
+    score = likeness(copies, image, state.pose)
+    return state.pose[distinct(state.pose, score, reference.radius)[:most]]
+
+
+def likeness(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
+    """Correlation (K,) off the plane of light at poses (K, 3); -1 where too little of the template is in the image."""
+    warp = warps(reference, pose)
+    weight = reference.weight * inside(warp, reference.pixels, (image.shape[-2], image.shape[-1]))
+    score = flat_correlation(reference._replace(weight=weight), Bilinear(image)(warp, reference.pixels))
+    enough = (weight.sum(-1) >= LEAST_SEEN * reference.weight.sum(-1)) & pose.isfinite().all(-1)
+    return torch.where(enough, score, -1.0)
+
+
+def distinct(pose: Tensor, score: Tensor, radius: Tensor, apart: float = DISTINCT) -> Tensor:
+    """Indices of the poses (K, 3) that are ``apart`` px from all of a better score (K,), the best first."""
+    order = score.argsort(descending=True, stable=True)
+    step = pose[order][:, None] - pose[order][None]
+    turn = unwrap(step[..., 2], torch.zeros_like(step[..., 2]))
+    same = torch.hypot(step[..., 0], step[..., 1]) + radius * turn.abs() < apart
+    return order[~same.tril(-1).any(-1)]
+
+
+def _copies(reference: Reference, count: int) -> Reference:
+    return reference.select(torch.zeros(count, dtype=torch.int64, device=reference.K.device))
+
+
+def as_good(score: Tensor, best: Tensor) -> Tensor:
+    """Whether a ``score`` tells no worse match than the ``best`` one, any shape: bool."""
+    factor, slack = AS_GOOD
+    return 1 - score <= factor * (1 - best) + slack
+
+
+def _decide(found: list[tuple[Estimate, Tensor]]) -> Located:
+    """Best and runner-up of each template's candidates (K, ...)."""
+
+    def pick(rank: int) -> tuple[Estimate, Tensor]:
+        rows = [(e, s, min(rank, len(s) - 1)) for e, s in found]
+        fields = zip(*([value[k] for value in e] for e, _, k in rows), strict=True)
+        score = torch.stack([s[k] if k == rank else torch.full_like(s[0], -1.0) for _, s, k in rows])
+        return Estimate(*map(torch.stack, fields)), score
+
+    (best, score), (second, other) = pick(0), pick(1)
+    return Located(best, score, second, other, as_good(other, score) | (best.status == Status.LOW_TEXTURE))
