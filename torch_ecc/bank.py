@@ -20,8 +20,8 @@ from torch_ecc.sampling import Bilinear, BSpline, inside, prefilter
 
 SMALLEST_SEARCHED = 24  # px: root of the area that a template keeps at the level at which it is searched for
 LEAST_DENSITY = 0.25  # of a level's pixels: texture per bandwidth, over that of white texture of the same contrast
-TURN_LOSS = 0.15  # of the correlation, half way between two turns
-COARSEST_TURN, FINEST_TURN = math.radians(8), math.radians(1.5)
+TURN_LOSS = 0.1  # of the correlation, half way between two turns
+COARSEST_TURN, FINEST_TURN = math.radians(6), math.radians(1.5)
 LARGEST_DISC = 24  # px: turns get finer with the radius, and this many pixels tell enough
 DISC_SHARE = 0.5  # of the texture must lie in a disc for the disc alone to be searched for
 FLATTEST = 1e-4  # of the frame's variance: flatter places match nothing
@@ -69,8 +69,8 @@ class Bank(NamedTuple):
         floor = FLATTEST * image.square().mean() * self.weight[0, 0, 0].real
         padded = F.pad(image[None, None], (self.reach,) * 4, mode="replicate")[0, 0]
         spectrum, square = (torch.fft.rfft2(i, s=self.shape) for i in (padded, padded * padded))
-        places, turns, scores = [], [], []
-        norm = None
+        places, turns = [], []
+        norm: Tensor | None = None
         for k in range(0, len(self.turns), CHUNK):
             part = slice(k, k + CHUNK)
             if norm is None or len(self.weight) > 1:
@@ -78,15 +78,12 @@ class Bank(NamedTuple):
                 power -= self._correlate(spectrum, self.planes[part]).square().sum(1)
                 norm = power.clamp(min=floor.clamp(min=1e-12)).rsqrt()
             score, turn = (self._correlate(spectrum, self.texture[part]) * norm).max(0)
-            score, place = _local_maxima(score).flatten().topk(min(most, score.numel()))
-            places.append(place)
-            turns.append(self.turns[part][turn.flatten()[place]])
-            scores.append(score)
-        place, turn = torch.cat(places), torch.cat(turns)
-        columns = (place % self.size[1], place // self.size[1], turn)
-        pose = torch.stack([column.to(self.offset.dtype) for column in columns], -1)
+            places.append(_peaks(score, most))
+            turns.append(self.turns[part][turn.flatten()[places[-1].pixel]])
+        peaks = Peaks(*(torch.cat(values) for values in zip(*places, strict=True)))
+        pose = torch.cat((peaks.place, torch.cat(turns)[:, None]), -1).to(self.offset.dtype)
         back = torch.cat((-self.offset, self.offset.new_zeros(1)))
-        return compose(pose, back.expand_as(pose)), torch.cat(scores)
+        return compose(pose, back.expand_as(pose)), peaks.score
 
     def _correlate(self, spectrum: Tensor, kernels: Tensor) -> Tensor:
         h, w = self.size
@@ -94,12 +91,30 @@ class Bank(NamedTuple):
         return whole[..., :h, :w]
 
 
-def _local_maxima(score: Tensor) -> Tensor:
-    """``score`` (h, w) where it is no less than its eight neighbours, -1 elsewhere."""
+class Peaks(NamedTuple):
+    """Maxima of an image: number of the ``pixel`` (K,), ``place`` (K, 2) between pixels, height ``score`` (K,)."""
+
+    pixel: Tensor
+    place: Tensor
+    score: Tensor
+
+
+def _peaks(score: Tensor, most: int) -> Peaks:
+    """The ``most`` highest of the pixels of ``score`` (h, w) that are no less than their neighbours, by parabolas."""
+    h, w = score.shape
     wide = F.pad(score, (1, 1, 1, 1), value=-1.0)
     across = torch.maximum(torch.maximum(wide[:, :-2], wide[:, 2:]), wide[:, 1:-1])
     around = torch.maximum(torch.maximum(across[:-2], across[2:]), across[1:-1])
-    return torch.where(score >= around, score, -1.0)
+    top, index = torch.where(score >= around, score, -1.0).flatten().topk(min(most, score.numel()))
+    place, height = torch.stack((index % w, index // w), -1).to(score.dtype), top
+    for axis, step, n in ((0, 1, w), (1, w, h)):
+        framed = (place[:, axis] > 0) & (place[:, axis] < n - 1)
+        before, after = (score.flatten()[(index + s).clamp(0, h * w - 1)] for s in (-step, step))
+        slope, bend = (after - before) / 2, (2 * top - before - after).clamp(min=1e-6)
+        offset = torch.where(framed, (slope / bend).clamp(-0.5, 0.5), 0.0)
+        place[:, axis] += offset
+        height = height + slope * offset / 2
+    return Peaks(index, place, height)
 
 
 def search_level(references: list[Reference]) -> int:

@@ -48,6 +48,7 @@ def demo(out: str, frames: int) -> None:
 @click.option("--size", metavar="N|WxH", help="Size of the templates, px.")
 @click.option("--polygon", "polygons", multiple=True, metavar="'X,Y X,Y ...'", help="Outline of a template, frame px.")
 @click.option("--reference", help="Image to cut the templates from [default: the first frame].")
+@click.option("--template", multiple=True, help="Image of a template: found anywhere in the first frame, at any angle.")
 @click.option("--config", type=click.Path(), help="TOML file of settings; options given here win.")
 @click.option("--out", help="Folder for the outputs [default: torch-ecc-out].")
 @click.option("--um-per-px", type=float, help="Scale of the camera: adds micrometres.")
@@ -61,14 +62,14 @@ def demo(out: str, frames: int) -> None:
 @click.option("--levels", type=int, help="Pyramid levels, for large motion [default: 1].")
 @click.option("--prediction", help="Start of each frame: hold or velocity [default: velocity].")
 @click.option("--min-score", type=float, help="Below this correlation a template is lost [default: 0.5].")
-@click.option("--search/--no-search", default=None, help="Look around for a lost template [default: yes].")
+@click.option("--search/--no-search", default=None, help="Look for a lost template in the whole frame [default: yes].")
 @click.option("--device", help="cpu, cuda, ... [default: cpu].")
 @click.option("--overlay/--no-overlay", default=None, help="Write overlay.mp4 [default: yes].")
 def track(config: str | None, size: str | None, polygons: tuple[str, ...], **options: Any) -> None:
     """Track patches through a video: x, y and theta of each in every frame.
 
     INPUT is a video, a folder or glob of images, a multi-page TIFF, an .npy or .npz stack or a camera index. Repeat
-    --center (or --polygon) for more templates.
+    --center (or --polygon, or --template) for more templates.
     """
     from torch_ecc.session import Session, TrackJob
 

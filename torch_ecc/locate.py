@@ -23,11 +23,13 @@ from torch_ecc.sampling import Bilinear, halve, inside
 from torch_ecc.solver import Settings, State, stage, warps
 
 LEVELS = 8  # of a pyramid at most: it ends where the template gets too small
-CANDIDATES = 32  # local maxima of the correlation that are looked at
+CANDIDATES = 192  # local maxima of the correlation that are looked at, if so many are nearly as high as the best one
+HANDICAP = 0.25  # of correlation: what the best place may lack on the grid of pixels and turns
+SURVIVORS = 16  # of them, brought to the next level
 FINALISTS = 3  # of them, brought to the answer
-COARSE_ITERATIONS = 8
+COARSE_ITERATIONS = 6
 COARSE_TOLERANCE = 0.1  # px of a coarse level
-NEIGHBOURS = 3.0  # px of the search's level at the farthest pixel: maxima nearer than that lead to one pose
+NEIGHBOURS = 1.5  # px of the search's level at the farthest pixel: maxima nearer than that lead to one pose
 DISTINCT = 1.5  # px at the farthest pixel: nearer than that two poses are one
 LEAST_SEEN = 0.4  # of a template's weight must lie in the frame
 AS_GOOD = (1.5, 0.01)  # a runner-up is as good if what its score lacks to 1 is at most a times the best one's, plus b
@@ -100,9 +102,15 @@ class Locator:
             self.pyramids.append(references[: level + 1])
             self.banks.append(Bank.of(references[level], (h, w)))
 
+    @property
+    def levels(self) -> int:
+        """How many levels of a frame it needs."""
+        return max(map(len, self.pyramids))
+
     @torch.no_grad()
-    def __call__(self, image: Tensor) -> Located:
-        """The templates in ``image``, (1 or B, 1, H, W) or as the tracker takes it, of the locator's size."""
+    def __call__(self, image: Tensor, near: Tensor | None = None) -> Located:
+        """The templates in ``image``, (1 or B, 1, H, W) or as the tracker takes it, of the locator's size; of places
+        that look alike the one nearest to ``near`` (B, 2 or 3), px (and rad), if that is given."""
         gray = as_gray("locate", "image", image)
         count, device = len(self.banks), self.banks[0].turns.device
         if gray.shape[-2:] != self.size or len(gray) not in (1, count):
@@ -110,27 +118,42 @@ class Locator:
             raise ValueError(f"locate: image must be {n} of {w}x{h} px, got {tuple(gray.shape)}")
         if gray.device != device:
             raise ValueError(f"locate: image must be on the reference's device {device}, got {gray.device}")
-        levels = max(map(len, self.pyramids))
-        images = halvings(gray, levels)
-        return _decide([self.candidates(images, b) for b in range(count)])
+        if near is not None and (near.dim() != 2 or len(near) != count or near.shape[1] not in (2, 3)):
+            raise ValueError(f"locate: near must be ({count}, 2) or ({count}, 3), got {tuple(near.shape)}")
+        images = halvings(gray, self.levels)
+        places = [None] * count if near is None else list(near.to(self.pyramids[0][0].radius))
+        return _decide([self.candidates(images, b, places[b]) for b in range(count)])
 
-    def candidates(self, images: list[Tensor], b: int) -> tuple[Estimate, Tensor]:
-        """Template ``b`` in frames given as ``halvings`` (1 or B, 1, h, w): at most FINALISTS distinct poses (K, ...) and
-        their scores (K,), the best first."""
-        references, bank = self.pyramids[b], self.banks[b]
+    def candidates(self, images: list[Tensor], b: int, near: Tensor | None = None) -> tuple[Estimate, Tensor]:
+        """Template ``b`` in frames given as ``halvings`` (1 or B, 1, h, w): a few distinct poses (K, ...) and their
+        scores (K,), the best first; of equally good ones those nearest to ``near`` (2,) or (3,) first."""
         images = [image if len(image) == 1 else image[b : b + 1] for image in images]
-        top = len(references) - 1
-        pose, score = bank.candidates(images[top][0, 0], CANDIDATES // 2)
-        pose = pose[distinct(pose, score, references[top].radius, NEIGHBOURS)[:CANDIDATES]]
-        for level in range(top, min(top, 1) - 1, -1):  # the last level is left to the refinement
-            pose = descend(references[level], images[level], pose, FINALISTS * max(level, 1))
-            pose = pose * pose.new_tensor((2.0, 2.0, 1.0)) if level else pose
-        pose = torch.cat((pose[:, :2], unwrap(pose[:, 2:], torch.zeros_like(pose[:, 2:]))), -1)
-        copies = _copies(references[0], len(pose))
-        estimate = solve(copies, images[0], pose, self.settings)
+        reference = self.pyramids[b][0]
+        pose = self.coarse(images, b)
+        chosen = pose[:FINALISTS]
+        if near is not None and len(pose) > FINALISTS:
+            rest = pose[FINALISTS:]
+            chosen = torch.cat((chosen, rest[distance(rest, near, reference.radius).argmin()][None]))
+        copies = _copies(reference, len(chosen))
+        estimate = solve(copies, images[0], chosen, self.settings)
         score = likeness(copies, images[0], estimate.pose)
-        kept = distinct(estimate.pose, score, references[0].radius)
-        return Estimate(*(value[kept] for value in estimate)), score[kept]
+        order = distinct(estimate.pose, score, reference.radius)
+        if near is not None:
+            away = distance(estimate.pose[order], near, reference.radius)
+            away = torch.where(as_good(score[order], score[order[0]]), away, torch.inf)
+            order = order[away.argsort(stable=True)]
+        return Estimate(*(value[order] for value in estimate)), score[order]
+
+    def coarse(self, images: list[Tensor], b: int) -> Tensor:
+        """Poses (K, 3) of template ``b`` in one frame before they are refined at its full resolution, best first."""
+        references, bank = self.pyramids[b], self.banks[b]
+        top = len(references) - 1
+        pose, score = bank.candidates(images[top][0, 0], CANDIDATES)
+        pose = pose[foremost(pose, score, references[top].radius, NEIGHBOURS)]
+        for level in range(top, min(top, 1) - 1, -1):  # the last level is left to the refinement
+            pose = descend(references[level], images[level], pose)
+            pose = pose * pose.new_tensor((2.0, 2.0, 1.0)) if level else pose
+        return torch.cat((pose[:, :2], unwrap(pose[:, 2:], torch.zeros_like(pose[:, 2:]))), -1)
 
 
 def halvings(image: Tensor, levels: int) -> list[Tensor]:
@@ -141,12 +164,13 @@ def halvings(image: Tensor, levels: int) -> list[Tensor]:
     return images
 
 
-def descend(reference: Reference, image: Tensor, pose: Tensor, most: int) -> Tensor:
-    """Candidates (K, 3) of one template brought to their best nearby: the ``most`` best of them that differ."""
+def descend(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
+    """Candidates (K, 3) of one template brought to their best nearby: those that differ and may be it, best first."""
     copies = _copies(reference, len(pose))
     state = stage(copies, image, State.start(copies, pose), "bilinear", COARSE_TOLERANCE, COARSE_ITERATIONS)
-    score = likeness(copies, image, state.pose)
-    return state.pose[distinct(state.pose, score, reference.radius)[:most]]
+    before, after = likeness(copies, image, pose), likeness(copies, image, state.pose)
+    pose = torch.where((after > before)[:, None], state.pose, pose)
+    return pose[foremost(pose, torch.maximum(before, after), reference.radius, DISTINCT)[:SURVIVORS]]
 
 
 def likeness(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
@@ -158,13 +182,27 @@ def likeness(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
     return torch.where(enough, score, -1.0)
 
 
+def distance(a: Tensor, b: Tensor, radius: Tensor) -> Tensor:
+    """How far poses (..., 3) are apart at most at ``radius`` px, (...): the turn is left out if ``b`` is (..., 2)."""
+    step = a[..., : b.shape[-1]] - b
+    turn = unwrap(step[..., 2:], torch.zeros_like(step[..., 2:])).abs().sum(-1)
+    return torch.hypot(step[..., 0], step[..., 1]) + radius * turn
+
+
 def distinct(pose: Tensor, score: Tensor, radius: Tensor, apart: float = DISTINCT) -> Tensor:
     """Indices of the poses (K, 3) that are ``apart`` px from all of a better score (K,), the best first."""
     order = score.argsort(descending=True, stable=True)
-    step = pose[order][:, None] - pose[order][None]
-    turn = unwrap(step[..., 2], torch.zeros_like(step[..., 2]))
-    same = torch.hypot(step[..., 0], step[..., 1]) + radius * turn.abs() < apart
+    same = distance(pose[order][:, None], pose[order][None], radius) < apart
     return order[~same.tril(-1).any(-1)]
+
+
+def foremost(pose: Tensor, score: Tensor, radius: Tensor, apart: float) -> Tensor:
+    """``distinct`` of those whose score (K,) does not fall behind the best one's by more than a better place between
+    two pixels and two turns can make up for; CANDIDATES at most, the runner-up among them."""
+    kept = distinct(pose, score, radius, apart)[:CANDIDATES]
+    hopeful = score[kept] >= score[kept[0]] - HANDICAP
+    hopeful[:2] = True
+    return kept[hopeful]
 
 
 def _copies(reference: Reference, count: int) -> Reference:
@@ -187,4 +225,5 @@ def _decide(found: list[tuple[Estimate, Tensor]]) -> Located:
         return Estimate(*map(torch.stack, fields)), score
 
     (best, score), (second, other) = pick(0), pick(1)
-    return Located(best, score, second, other, as_good(other, score) | (best.status == Status.LOW_TEXTURE))
+    alike = as_good(torch.minimum(score, other), torch.maximum(score, other))
+    return Located(best, score, second, other, alike | (best.status == Status.LOW_TEXTURE))

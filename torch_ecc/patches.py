@@ -84,16 +84,6 @@ def cut(frame: Tensor, patches: Patches, criterion: Criterion) -> Reference:
     return prepare(template, criterion=criterion, mask=mask, centre=patches.centers - middle)
 
 
-def halve_patches(patches: Patches) -> Patches:
-    """The same templates on the halved frame, whose pixel (i, j) is pixel (2 i, 2 j) of the frame."""
-    (h, w), first = patches.size, patches.corner.remainder(2)
-    x = first[:, :1] + torch.arange(0, w - 1, 2, device=first.device)
-    y = first[:, 1:] + torch.arange(0, h - 1, 2, device=first.device)
-    which = torch.arange(len(first), device=first.device)[:, None, None]
-    mask = patches.mask[which, 0, y[:, :, None], x[:, None, :]][:, None]
-    return Patches(patches.centers / 2, (patches.corner + first) // 2, (y.shape[1], x.shape[1]), mask)
-
-
 @torch.no_grad()
 def texture(
     frame: Tensor,

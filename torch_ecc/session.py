@@ -19,7 +19,9 @@ from torch import Tensor
 
 from torch_ecc.calibration import Calibration
 from torch_ecc.estimate import Estimate, Status
+from torch_ecc.frame import as_gray
 from torch_ecc.io import OverlayWriter, TrackWriter, open_frames
+from torch_ecc.locate import Located
 from torch_ecc.plots import plot_track
 from torch_ecc.tracker import Tracker
 
@@ -32,7 +34,8 @@ class TrackJob:
     """Settings of a run, as in configs/track.toml and the options of ``torch-ecc track``.
 
     ``input``: see ``io.open_frames``; ``reference``: the image to cut the templates from (default: the first frame of
-    the input, which then counts as frame 0); ``centers`` px and ``size`` px as in ``Tracker``; ``polygons``: one list
+    the input, which then counts as frame 0); ``template``: images of the templates themselves, all of one size, found
+    anywhere in the first frame (of places that look alike, nearest to ``centers`` if given); ``centers`` px and ``size`` px as in ``Tracker``; ``polygons``: one list
     of (x, y) px corners per template instead of, or within, the squares; the other names are ``Tracker``'s and
     ``Calibration``'s.
     """
@@ -40,6 +43,7 @@ class TrackJob:
     input: str
     out: str = "torch-ecc-out"
     reference: str | None = None
+    template: tuple[str, ...] = ()
     centers: tuple[Point, ...] = ()
     size: int | tuple[int, int] | None = None
     polygons: tuple[tuple[Point, ...], ...] = ()
@@ -72,6 +76,12 @@ class Templates(NamedTuple):
     size: tuple[int, int]
     mask: Tensor | None
 
+    @staticmethod
+    def of(crops: Tensor) -> Templates:
+        """The templates that images (R, 1, h, w) show, each in its own coordinates."""
+        h, w = crops.shape[-2:]
+        return Templates(torch.tensor([[(w - 1) / 2, (h - 1) / 2]]).repeat(len(crops), 1), (h, w), None)
+
     @property
     def shapes(self) -> list[tuple[int, int] | Tensor]:
         """What each template covers, for drawing."""
@@ -97,7 +107,8 @@ class Session:
 
     def __init__(self, job: TrackJob) -> None:
         self.job, self.calibration = job, job.calibration()
-        self.templates = choose_templates(job)
+        crops = read_templates(job)
+        self.templates = choose_templates(job) if crops is None else Templates.of(crops)
         self.source = open_frames(job.input)
         frames = iter(self.source)
         first = next(frames) if job.reference is None else next(iter(open_frames(job.reference)))
@@ -107,7 +118,12 @@ class Session:
         )
         options = {name: getattr(job, name) for name in names.split()}
         centers, size, mask = self.templates
-        self.tracker = Tracker(first, centers, size, mask=mask, **options)
+        if crops is None:
+            self.tracker = Tracker(first, centers, size, mask=mask, **options)
+        else:
+            near = torch.tensor(job.centers).double() if job.centers else None
+            self.tracker, located = Tracker.find(crops, first, near=near, **options)
+            refuse_doubt(located, near is not None)
         if self.source.shape != first.shape[-2:]:
             (h, w), (h0, w0) = self.source.shape, first.shape[-2:]
             raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
@@ -162,6 +178,44 @@ class Session:
 class _NoOverlay(nullcontext[None]):
     def write(self, frame: Tensor, estimate: Estimate) -> None:
         """Nothing: the run goes without pictures."""
+
+
+def read_templates(job: TrackJob) -> Tensor | None:
+    """The images of ``job.template``, (R, 1, h, w) float, None if there are none. ValueError if they do not fit."""
+    if not job.template:
+        return None
+    for name, given in (("reference", job.reference), ("size", job.size), ("polygons", job.polygons)):
+        if given:
+            raise ValueError(f"{name}: not with template, whose image tells it all; got {given}")
+    if job.centers and len(job.centers) != len(job.template):
+        raise ValueError(f"centers: expected one per template ({len(job.template)}), got {len(job.centers)}")
+    crops = [as_gray("template", name, next(iter(open_frames(name)))) for name in job.template]
+    sizes = {f"{crop.shape[-1]}x{crop.shape[-2]}" for crop in crops}
+    if len(sizes) > 1:
+        raise ValueError(f"template: expected images of one size, got {sorted(sizes)} px")
+    return torch.cat(crops)
+
+
+def refuse_doubt(located: Located, placed: bool) -> None:
+    """ValueError for the first template that the first frame does not show, or shows at several places unless it is
+    known which one is meant."""
+    for r, status in enumerate(located.status.tolist()):
+        best, other = (_place(*p.tolist()) for p in (located.pose[r], located.runner_up.pose[r]))
+        score, second = float(located.score[r]), float(located.runner_up_score[r])
+        if not Status.good(located.status[r]):
+            sentence = Status.describe(status)
+            raise ValueError(
+                f"template: number {r} is not in the first frame (best: {best}, score {score:.3f}). {sentence}"
+            )
+        if bool(located.ambiguous[r]) and not placed:
+            raise ValueError(
+                f"template: number {r} may be at {best} (score {score:.3f}) or at {other} (score {second:.3f}); "
+                "a center tells which one is meant"
+            )
+
+
+def _place(x: float, y: float, theta: float) -> str:
+    return f"x={x:.1f}, y={y:.1f}, theta={math.degrees(theta):.1f} deg"
 
 
 def choose_templates(job: TrackJob) -> Templates:

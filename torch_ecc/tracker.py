@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
-from typing import Self
+from dataclasses import replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -13,21 +13,20 @@ from torch_ecc.align import solve
 from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.estimate import Estimate, Status, Track
 from torch_ecc.frame import as_device, as_gray
-from torch_ecc.patches import Centers, Patches, Size, cut, halve_patches, locate_patches
-from torch_ecc.pose import compose, inverse
+from torch_ecc.locate import LEAST_SEEN, Located, Locator, halvings
+from torch_ecc.patches import Centers, Size, cut, locate_patches
+from torch_ecc.pose import compose, inverse, unwrap
+from torch_ecc.pyramid import SMALLEST_COARSE, pyramid
 from torch_ecc.reference import Reference
-from torch_ecc.sampling import halve
-from torch_ecc.search import best_match
 from torch_ecc.solver import Settings, State, stage
 
 PREDICTIONS = ("hold", "velocity")
-SMALLEST_COARSE = 12  # px: a template is not halved below this side
-SEARCHED = (
-    40  # px: for the search a template is halved until its smaller side is at most this; its cost grows as side^4
-)
 COARSE_TOLERANCE = 0.1  # px of a coarse level
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
 MEMORY = 0.05  # weight of the newest frame in the usual score
+AT_ONCE = 8  # templates searched for in one frame; the others in turn
+PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
+SELDOM = 16  # frames between two searches for what has been lost for long
 
 
 class SequenceError(ValueError):
@@ -47,15 +46,16 @@ class Tracker(nn.Module):
     "bilinear", "bspline3", "bspline5"; ``tolerance``: px at the template's corner; ``levels``: pyramid levels;
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
-    the frame's); ``min_score``: below it a template is lost; ``search``: look for a lost template around its last good
-    pose, with a pyramid, in this and the following frames. Raises ValueError for what does not fit.
+    the frame's); ``min_score``: below it a template is lost; ``search``: look for a lost template in the whole frame,
+    at any angle, in every frame at first and ever more seldom the longer it is gone (every 16th frame in the end).
+    Raises ValueError for what does not fit.
     """
 
     pose: Tensor
     velocity: Tensor
     start: Tensor
     score: Tensor
-    tracked: Tensor
+    missed: Tensor
 
     def __init__(  # noqa: PLR0913 - the constructor is the list of all choices
         self,
@@ -86,8 +86,7 @@ class Tracker(nn.Module):
         with torch.no_grad():
             patches = locate_patches("Tracker", gray, centers, size, mask)
             _check_levels(levels, patches.size)
-            wanted = max(levels, search_levels(patches.size)) if search else levels
-            self.references = pyramid(gray, patches, chosen, wanted)
+            self.references = pyramid(cut(gray, patches, chosen), levels)
         if len(self.references) < levels:
             raise ValueError(f"levels: expected at most {len(self.references)} for these templates, got {levels}")
         self.levels = levels
@@ -96,13 +95,36 @@ class Tracker(nn.Module):
         self.register_buffer("pose", start.clone())
         self.register_buffer("velocity", torch.zeros_like(start))
         self.register_buffer("score", expected_score(self.references[0]).to(start.dtype))
-        self.register_buffer("tracked", torch.ones_like(start[:, 0], dtype=torch.bool))
+        self.register_buffer("missed", torch.zeros_like(start[:, 0], dtype=torch.int64))  # frames in a row
+        self._locators: dict[int, Locator] = {}  # of the templates last searched for
+        self._turn = 0  # whose turn it is if they are many
+
+    @classmethod
+    def find(
+        cls, template: Tensor, frame: Tensor, *, near: Tensor | None = None, **options: Any
+    ) -> tuple[Tracker, Located]:
+        """A tracker of ``template`` (h, w), (C, h, w) or (R, C, h, w), cut from some other image, that starts where
+        ``locate`` finds it in ``frame``, at any angle; and what it has found, to be judged by the caller.
+
+        Of places that look alike the one nearest to ``near`` (R, 2 or 3) is taken. ``options``: the constructor's.
+        theta counts from the template's own image; ``displacement`` from where it was found.
+        """
+        gray = as_gray("find", "template", template, as_device("find", options.get("device")))
+        h, w = gray.shape[-2:]
+        tracker = cls(gray, [((w - 1) / 2, (h - 1) / 2)] * len(gray), (h, w), **options)
+        view = as_gray("find", "frame", frame, tracker.pose.device)
+        settings = replace(tracker.settings, min_visible=LEAST_SEEN)
+        located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
+        tracker.frame_shape = tuple(view.shape)
+        tracker.start, tracker.pose = located.pose.clone(), located.pose.clone()
+        return tracker, located
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # Only the device may change: poses stay float64 and pixels float32 whatever the rest of a model is cast to.
         device = fn(self.score).device
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
         self.references = [reference.map(lambda tensor: tensor.to(device)) for reference in self.references]
+        self._locators.clear()
         return self
 
     @torch.no_grad()
@@ -115,11 +137,11 @@ class Tracker(nn.Module):
         if gray.shape != self.frame_shape:
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(gray.shape)}")
         images = [gray]
-        estimate = self._solve(images, compose(self.pose, self.velocity), self.levels)
-        missing = (estimate.status == Status.LOST) | (estimate.status == Status.OUT_OF_VIEW)
-        lost = missing.nonzero()[:, 0]
-        if len(lost) and self.search:
-            estimate = self._search(images, estimate, lost)
+        estimate = self._solve(images, compose(self.pose, self.velocity))
+        if self.search:
+            missing = (estimate.status == Status.LOST) | (estimate.status == Status.OUT_OF_VIEW)
+            for index in self._due(missing):
+                estimate = self._search(images, estimate, index)
         return self._advance(estimate)
 
     def track(self, frame: Tensor) -> Estimate:
@@ -141,64 +163,53 @@ class Tracker(nn.Module):
             raise ValueError("track_sequence: frames must hold at least one frame, got none")
         return Track.stack(estimates)
 
-    def _solve(self, images: list[Tensor], pose: Tensor, levels: int, index: Tensor | None = None) -> Estimate:
-        """Coarse to fine; ``images`` grows to as many levels as are needed. ``index``: only these templates."""
-        references = self.references[:levels]
-        if index is not None:
-            references = [reference.select(index) for reference in references]
-        while len(images) < len(references):
-            images.append(halve(images[-1]))
-        for level in range(len(references) - 1, 0, -1):
-            image = images[level] if index is None or len(images[level]) == 1 else images[level][index]
-            scale = pose.new_tensor((2.0**level, 2.0**level, 1.0))
-            state = State.start(references[level], pose / scale)
-            budget = self.settings.max_iterations
-            pose = stage(references[level], image, state, "bilinear", COARSE_TOLERANCE, budget).pose * scale
-        image = images[0] if index is None or len(images[0]) == 1 else images[0][index]
-        return solve(references[0], image, pose, self.settings)
+    def _solve(self, images: list[Tensor], pose: Tensor) -> Estimate:
+        """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are."""
+        images += halvings(images[-1], self.levels)[1:]
+        for level in range(self.levels - 1, 0, -1):
+            reference, scale = self.references[level], pose.new_tensor((2.0**level, 2.0**level, 1.0))
+            state, budget = State.start(reference, pose / scale), self.settings.max_iterations
+            pose = stage(reference, images[level], state, "bilinear", COARSE_TOLERANCE, budget).pose * scale
+        return solve(self.references[0], images[0], pose, self.settings)
 
-    def _search(self, images: list[Tensor], estimate: Estimate, lost: Tensor) -> Estimate:
-        """Second attempt for the templates at ``lost``: at the best match around the last good pose, coarse to fine."""
-        top = len(self.references) - 1
-        while len(images) <= top:
-            images.append(halve(images[-1]))
-        image = images[top] if len(images[top]) == 1 else images[top][lost]
-        scale = self.pose.new_tensor((2.0**top, 2.0**top, 1.0))
-        start = best_match(self.references[top].select(lost), image, self.pose[lost] / scale) * scale
-        found = self._solve(images, start, top + 1, lost)
-        familiar = found.score >= FAMILIAR * self.score[lost]
-        better = ((found.status == Status.CONVERGED) & familiar).nonzero()[:, 0]
-        chosen = Estimate(*(f[better] for f in found))
-        return Estimate(*(e.index_copy(0, lost[better], c) for e, c in zip(estimate, chosen, strict=True)))
+    def _due(self, missing: Tensor) -> list[int]:
+        """Which of the ``missing`` templates (R,) to search for in this frame."""
+        missed = self.missed.tolist() if bool(missing.any()) else []
+        due = [r for r, n in enumerate(missed) if missing[r] and n % min(2 ** (n // PATIENCE), SELDOM) == 0]
+        if len(due) > AT_ONCE:
+            self._turn = (self._turn + AT_ONCE) % len(due)
+            due = due[self._turn :] + due[: self._turn]
+        return due[:AT_ONCE]
+
+    def _search(self, images: list[Tensor], estimate: Estimate, r: int) -> Estimate:
+        """Second attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
+        locator = self._locators.get(r)
+        if locator is None:
+            if len(self._locators) >= AT_ONCE:
+                del self._locators[next(iter(self._locators))]
+            one = self.references[0].select(torch.tensor([r], device=self.pose.device))
+            locator = Locator(
+                one, (images[0].shape[-2], images[0].shape[-1]), replace(self.settings, min_visible=LEAST_SEEN)
+            )
+            self._locators[r] = locator
+        images += halvings(images[-1], locator.levels - len(images) + 1)[1:]
+        own = [image if len(image) == 1 else image[r : r + 1] for image in images]
+        found, score = locator.candidates(own, 0, self.pose[r])
+        if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * self.score[r]:
+            return estimate
+        best = found._replace(pose=torch.cat((found.pose[:, :2], unwrap(found.pose[:, 2:], self.pose[r, 2])), -1))
+        index = torch.tensor([r], device=self.pose.device)
+        return Estimate(*(e.index_copy(0, index, f[:1]) for e, f in zip(estimate, best, strict=True)))
 
     def _advance(self, estimate: Estimate) -> Estimate:
         good = Status.good(estimate.status)[:, None]
         pose = torch.where(good, estimate.pose, self.pose)
         if self.prediction == "velocity":
             # The last step in the template's own axes: exact for a constant turn about any point of the stage.
-            self.velocity = torch.where(good & self.tracked[:, None], compose(inverse(self.pose), pose), 0.0)
-        self.pose, self.tracked = pose, good[:, 0]
-        self.score = torch.where(self.tracked, torch.lerp(self.score, estimate.score, MEMORY), self.score)
+            self.velocity = torch.where(good & (self.missed == 0)[:, None], compose(inverse(self.pose), pose), 0.0)
+        self.pose, self.missed = pose, torch.where(good[:, 0], 0, self.missed + 1)
+        self.score = torch.where(good[:, 0], torch.lerp(self.score, estimate.score, MEMORY), self.score)
         return estimate._replace(pose=pose.clone(), displacement=pose - self.start)
-
-
-def pyramid(frame: Tensor, patches: Patches, criterion: Criterion, levels: int) -> list[Reference]:
-    """References of the templates at up to ``levels`` levels, while they keep texture enough; level l has 2^-l px."""
-    references = [cut(frame, patches, criterion)]
-    while len(references) < levels and min(patches.size) // 2 >= SMALLEST_COARSE:
-        frame, patches = halve(frame), halve_patches(patches)
-        if int((patches.mask > 0).sum((1, 2, 3)).min()) < SMALLEST_COARSE**2 // 2:
-            break
-        try:
-            references.append(cut(frame, patches, criterion))
-        except ValueError:  # texture finer than this level: one single grey level is left
-            break
-    return references
-
-
-def search_levels(size: tuple[int, int]) -> int:
-    """Levels after which the smaller side of a template (h, w) is at most SEARCHED px, three at least."""
-    return max(3, math.ceil(math.log2(min(size) / SEARCHED)) + 1)
 
 
 def expected_score(reference: Reference) -> Tensor:
