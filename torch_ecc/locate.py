@@ -23,8 +23,10 @@ from torch_ecc.sampling import Bilinear, halve, inside
 from torch_ecc.solver import Settings, State, stage, warps
 
 LEVELS = 8  # of a pyramid at most: it ends where the template gets too small
+SMALLEST_FRAME = 12  # px: a frame is not halved below this side
 CANDIDATES = 192  # local maxima of the correlation that are looked at, if so many are nearly as high as the best one
 HANDICAP = 0.25  # of correlation: what the best place may lack on the grid of pixels and turns
+FEWEST = 16  # of them, however low: the runner-up is among them
 SURVIVORS = 16  # of them, brought to the next level
 FINALISTS = 3  # of them, brought to the answer
 COARSE_ITERATIONS = 6
@@ -87,7 +89,7 @@ def locate(
 class Locator:
     """Search for B prepared templates in frames of ``size`` (h, w), prepared once.
 
-    ``settings``: of the last refinement. Raises ValueError for what is no reference and for frames smaller than 12 px.
+    ``settings``: of the last refinement.
     """
 
     def __init__(self, reference: Reference, size: tuple[int, int], settings: Settings | None = None) -> None:
@@ -97,7 +99,7 @@ class Locator:
         device = reference.K.device
         for b in range(len(reference.K)):
             references = pyramid(reference.select(torch.tensor([b], device=device)), LEVELS)
-            level = search_level(references)
+            level = min(search_level(references), max((min(size) // SMALLEST_FRAME).bit_length() - 1, 0))
             h, w = (-(-n // 2**level) for n in size)
             self.pyramids.append(references[: level + 1])
             self.banks.append(Bank.of(references[level], (h, w)))
@@ -198,11 +200,12 @@ def distinct(pose: Tensor, score: Tensor, radius: Tensor, apart: float = DISTINC
 
 def foremost(pose: Tensor, score: Tensor, radius: Tensor, apart: float) -> Tensor:
     """``distinct`` of those whose score (K,) does not fall behind the best one's by more than a better place between
-    two pixels and two turns can make up for; CANDIDATES at most, the runner-up among them."""
-    kept = distinct(pose, score, radius, apart)[:CANDIDATES]
-    hopeful = score[kept] >= score[kept[0]] - HANDICAP
-    hopeful[:2] = True
-    return kept[hopeful]
+    pixels and turns can make up for; CANDIDATES at most, the runner-up among them."""
+    top, first = score.topk(min(2 * CANDIDATES, len(score)))
+    hopeful = top >= top[0] - HANDICAP
+    hopeful[:FEWEST] = True
+    first = first[hopeful]
+    return first[distinct(pose[first], score[first], radius, apart)[:CANDIDATES]]
 
 
 def _copies(reference: Reference, count: int) -> Reference:

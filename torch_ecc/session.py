@@ -35,9 +35,9 @@ class TrackJob:
 
     ``input``: see ``io.open_frames``; ``reference``: the image to cut the templates from (default: the first frame of
     the input, which then counts as frame 0); ``template``: images of the templates themselves, all of one size, found
-    anywhere in the first frame (of places that look alike, nearest to ``centers`` if given); ``centers`` px and ``size`` px as in ``Tracker``; ``polygons``: one list
-    of (x, y) px corners per template instead of, or within, the squares; the other names are ``Tracker``'s and
-    ``Calibration``'s.
+    anywhere in the first frame (of places that look alike, nearest to ``centers`` if given); ``centers`` and ``size``
+    px as in ``Tracker``; ``polygons``: one list of (x, y) px corners per template instead of, or within, the squares;
+    the other names are ``Tracker``'s and ``Calibration``'s.
     """
 
     input: str
