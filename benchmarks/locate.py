@@ -1,9 +1,11 @@
 """Global search: hit rate and time, beside cv2.matchTemplate: python benchmarks/locate.py [DATA] [poses] [threads].
 
-A hit is within 1 px and 1 deg before the last refinement. The 121 x 121 templates and the frames have noise of 5 grey
-levels of their own; frames are 640 x 480 px in uneven light, poses anywhere at any angle. OpenCV turns the same template
-by the same turns of the same level and takes the best TM_CCOEFF_NORMED; "fine" is the same at full resolution in steps of
-2 deg, every tenth pose. Both run alternately in one process, on as many threads; times are median and quartiles.
+A hit is within 1 px and 1 deg before the last refinement. Templates (121 x 121 px) and frames (640 x 480 px, uneven
+light) are drawn apart with noise of 5 grey levels (2 on the stills), poses anywhere at any angle. "worse": by more than
+0.001 px than tracking from the truth. OpenCV turns the same template by the same turns at the same level and takes the
+best TM_CCOEFF_NORMED: near is within two pixels and one turn of that bank, its time compares with "bank ms". "cv2 fine"
+is the same at full resolution in steps of 2 deg, in every tenth frame, hits as for locate. All run alternately in one
+process on as many threads; times are median and quartiles.
 """
 
 from __future__ import annotations
@@ -13,9 +15,10 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import torch
@@ -27,11 +30,13 @@ from torch_ecc import Locator, Status, align, prepare, texture
 from torch_ecc.io import open_frames
 from torch_ecc.locate import halvings
 from torch_ecc.pose import compose, inverse, to_opencv
+from torch_ecc.reference import Reference
 from torch_ecc.sim import Camera, GradientLight, Pads, PlaneWaves, Scene, Speckle, micrograph
 from torch_ecc.sim.still import image_scene
 
 SIZE, SIDE = (480, 640), 121
-console = Console(width=150)
+T = TypeVar("T")
+console = Console(width=170)
 
 
 class Trial(NamedTuple):
@@ -70,11 +75,9 @@ def parts(folder: Path) -> Iterator[Trial]:
         for fact, frame in zip(facts["frames"], open_frames(str(folder / "f*.png")), strict=True):
             turn = torch.tensor([0.0, 0.0, -math.radians(fact["theta_deg"])]).double()
             truth = compose(c, compose(turn, local))[None]
-            yield Trial(
-                still.reshape(1, 1, *still.shape[-2:])[..., y - half : y + half + 1, x - half : x + half + 1],
-                frame,
-                truth,
-            )
+            rows, columns = slice(y - half, y + half + 1), slice(x - half, x + half + 1)
+            template, image = (image.reshape(1, 1, *image.shape[-2:]) for image in (still, frame))
+            yield Trial(template[..., rows, columns], image, truth)
 
 
 def error(pose: Tensor, truth: Tensor) -> tuple[float, float]:
@@ -102,61 +105,75 @@ class TurnedBank:
 
     def __call__(self, image: Tensor) -> Tensor:
         """The best pose (1, 3) in ``image`` (h, w)."""
-        best = max(
-            (
-                cv2.minMaxLoc(cv2.matchTemplate(image.numpy(), t, cv2.TM_CCOEFF_NORMED)) + (k,)
-                for k, t in enumerate(self.templates)
-            ),
-            key=lambda found: found[1],
+        found = (cv2.minMaxLoc(cv2.matchTemplate(image.numpy(), t, cv2.TM_CCOEFF_NORMED)) for t in self.templates)
+        (_, _, _, (x, y)), k = max(((best, k) for k, best in enumerate(found)), key=lambda pair: pair[0][1])
+        middle = (self.side - 1) / 2
+        return torch.tensor([[x + middle, y + middle, float(self.turns[k])]], dtype=torch.float64)
+
+
+class Tally:
+    """What is counted and timed over the trials of one set."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.times: dict[str, list[float]] = {}
+
+    def timed(self, name: str, call: Callable[[], T]) -> T:
+        begun = time.perf_counter()
+        result = call()
+        self.times.setdefault(name, []).append(time.perf_counter() - begun)
+        return result
+
+    def row(self) -> tuple[str, ...]:
+        n, c, t = self.counts["trials"], self.counts, self.times
+        parts = (f"{c['hits']} of {n}", f"{c['told']} of {n - c['hits']}", str(c["alarms"]), str(c["worse"]))
+        near, fine = f"{c['near']} of {n}", f"{c['fine']} of {len(t['fine'])}"
+        return (
+            *parts,
+            quartiles(t["locate"]),
+            quartiles(t["bank"]),
+            near,
+            quartiles(t["cv2"]),
+            fine,
+            quartiles(t["fine"]),
         )
-        (x, y), middle = best[3], (self.side - 1) / 2
-        return torch.tensor([[x + middle, y + middle, float(self.turns[best[4]])]], dtype=torch.float64)
 
 
 def measure(trials: Iterator[Trial]) -> tuple[str, ...]:
     """One line of the table."""
-    hits, told, alarms, worse, cv_hits, fine = 0, 0, 0, 0, 0, []
-    times: dict[str, list[float]] = {"locate": [], "cv2": [], "fine": []}
-    count, locator, last = 0, None, None
-    for count, (template, frame, truth) in enumerate(trials, 1):
-        frame = frame.reshape(1, 1, *frame.shape[-2:])
-        if last is None or not torch.equal(template, last):
-            last, reference = template, prepare(template)
-            locator = Locator(reference, (frame.shape[-2], frame.shape[-1]))
-            level = locator.levels - 1
-            bank = TurnedBank(halvings(template.float(), level + 1)[-1][0, 0], locator.banks[0].turns)
-        begun = time.perf_counter()
-        found = locator(frame)
-        times["locate"].append(time.perf_counter() - begun)
-        images = halvings(frame.float(), locator.levels)
-        good = hit(locator.coarse(images, 0)[:1], truth)
-        hits += good
-        alarms += good and bool(found.ambiguous)
-        told += not good and (bool(found.ambiguous) or not bool(Status.good(found.status)))
-        worse += (
-            good and error(found.pose, truth)[0] > 1.001 * error(align(reference, frame, truth).pose, truth)[0] + 1e-3
-        )
-        begun = time.perf_counter()
-        rough = bank(halvings(frame.float(), level + 1)[-1][0, 0])
-        times["cv2"].append(time.perf_counter() - begun)
-        rough[:, :2] *= 2**level
-        px, deg = error(rough, truth)
-        step = math.degrees(math.tau / len(bank.turns))
-        cv_hits += px < 2 * 2**level and deg < step
-        if count % 10 == 1:
-            slow = TurnedBank(template[0, 0].float(), torch.arange(180) * math.radians(2.0))
-            begun = time.perf_counter()
-            fine.append(hit(slow(frame[0, 0].float()), truth) if begun else False)
-            times["fine"].append(time.perf_counter() - begun)
-    row = f"{hits} of {count}", f"{told} of {count - hits}", str(alarms), str(worse), f"{level}, {len(bank.turns)}"
-    return (
-        *row,
-        quartiles(times["locate"]),
-        f"{cv_hits} of {count}",
-        quartiles(times["cv2"]),
-        f"{sum(fine)} of {len(fine)}",
-        quartiles(times["fine"]),
-    )
+    tally, last = Tally(), None
+    for number, trial in enumerate(trials):
+        if last is None or not torch.equal(trial.template, last):
+            last, reference = trial.template, prepare(trial.template)
+            locator = Locator(reference, (trial.frame.shape[-2], trial.frame.shape[-1]))
+            level, turns = locator.levels - 1, locator.banks[0].turns
+            bank = TurnedBank(halvings(trial.template.float(), level + 1)[-1][0, 0], turns)
+        one(tally, trial, locator, reference)
+        grain = 0.3 * torch.randn(trial.frame.shape, generator=torch.Generator().manual_seed(number))
+        noisy = trial.frame.float() + grain  # without it OpenCV takes flat areas for perfect matches
+        coarse = halvings(noisy, level + 1)[-1][0, 0]
+        rough = tally.timed("cv2", lambda bank=bank, coarse=coarse: bank(coarse))
+        px, deg = error(rough * torch.tensor([2.0**level, 2.0**level, 1.0]), trial.truth)
+        tally.counts["near"] += px < 2 * 2**level and deg < 360 / len(turns)
+        if number % 10 == 0:
+            slow = TurnedBank(trial.template[0, 0].float(), torch.arange(180) * math.radians(2.0))
+            found = tally.timed("fine", lambda slow=slow, image=noisy[0, 0]: slow(image))
+            tally.counts["fine"] += hit(found, trial.truth)
+    return tally.row()
+
+
+def one(tally: Tally, trial: Trial, locator: Locator, reference: Reference) -> None:
+    """Locate one trial: hit or not, told or not, worse than tracking from the truth or not."""
+    found = tally.timed("locate", lambda: locator(trial.frame))
+    images = halvings(trial.frame.float(), locator.levels)
+    good, doubt = hit(locator.coarse(images, 0)[:1], trial.truth), bool(found.ambiguous)
+    tally.timed("bank", lambda: locator.banks[0].candidates(images[-1][0, 0], 1))
+    tracked = error(align(reference, trial.frame, trial.truth).pose, trial.truth)[0]
+    tally.counts["trials"] += 1
+    tally.counts["hits"] += good
+    tally.counts["alarms"] += good and doubt
+    tally.counts["told"] += not good and (doubt or not bool(Status.good(found.status)))
+    tally.counts["worse"] += good and error(found.pose, trial.truth)[0] > tracked + 1e-3
 
 
 def quartiles(seconds: list[float]) -> str:
@@ -169,9 +186,11 @@ def main() -> None:
     count = int(sys.argv[2]) if len(sys.argv) > 2 else 200
     torch.set_num_threads(int(sys.argv[3]) if len(sys.argv) > 3 else torch.get_num_threads())
     cv2.setNumThreads(torch.get_num_threads())
-    columns = ("hits", "misses told", "false alarms", "worse than tracking", "level, turns", "ms (IQR)")
-    others = ("cv2 same bank: near", "ms (IQR)", "cv2 fine: hits", "ms (IQR)")
-    table = Table("set", *columns, *others, title=f"Global search, {torch.get_num_threads()} threads")
+    ours = ("hits", "misses told", "false alarms", "worse", "ms", "bank ms")
+    theirs = ("cv2 near", "cv2 ms", "cv2 fine hits", "cv2 fine ms")
+    table = Table(
+        "set", *ours, *theirs, title=f"Global search, {torch.get_num_threads()} threads, times with quartiles"
+    )
     scenes: dict[str, Scene] = {
         "micrograph": micrograph(),
         "plane waves": PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0),
