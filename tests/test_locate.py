@@ -226,7 +226,7 @@ def test_a_batch_is_what_each_gives_alone():
         alone = locate(prepare(templates[b : b + 1]), frames[b : b + 1])
         assert (alone.pose[0] - found.pose[b]).abs().max() < 1e-4
     shared = locate(prepare(templates[:1].expand(2, -1, -1, -1)), frames[:1])
-    assert (shared.pose[0] - shared.pose[1]).abs().max() < 1e-6
+    assert (shared.pose[0] - shared.pose[1]).abs().max() < 1e-5
 
 
 def test_everything_is_on_one_device(device):

@@ -123,14 +123,16 @@ def prepare(
     _refuse_flat(gray, kept)
     wide = pad(gray, MARGIN)
     inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
-    sharp, soft = (torch.cat((gradients(image), image), 1)[inner] for image in (wide, blur(wide, INSTRUMENT_BLUR)))
+    soft, noise = blur(wide, INSTRUMENT_BLUR), template_noise(gray, kept)
+    slopes = gradients(soft)
+    images = torch.cat((gradients(wide), wide, slopes, soft, texture_share(slopes, noise)), 1)[inner]
     centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre).to(gray)
     if centre.shape != (len(gray), 2):
         raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
-    reference = _assemble(chosen, sharp, soft, kept, centre)
-    wrong = torch.stack([aliasing(wide, name)[inner] for name in ALIASING], 1).flatten(3)[
-        ..., (kept > 0).any(0).flatten()
-    ]
+    reference = _assemble(chosen, images, noise, kept, centre)
+    used = (kept > 0).any(0).flatten()
+    wrong = torch.cat([aliasing(wide, name) for name in ALIASING], 1)[inner].flatten(2)[:, :, used]
+    wrong = wrong.unflatten(1, (len(ALIASING), 2))
     return reference._replace(alias=(reference.K[:, None, :3] @ wrong.mT).to(reference.radius.dtype))
 
 
@@ -143,26 +145,45 @@ def _refuse_flat(gray: Tensor, kept: Tensor) -> None:
         raise ValueError(f"prepare: template must have texture, got one single grey level in template {flat}")
 
 
-def _assemble(criterion: Criterion, sharp: Tensor, soft: Tensor, kept: Tensor, centre: Tensor) -> Reference:
-    """Reference from the images [d/dx, d/dy, t] (B, 3, h, w), raw and blurred, and weights (1 or B, 1, h, w)."""
-    h, w = sharp.shape[-2:]
+def template_noise(gray: Tensor, kept: Tensor) -> Tensor:
+    """Upper estimate (B,) of the noise of templates (B, 1, h, w), grey levels, where ``kept`` > 0."""
+    weight = kept.flatten(1)
+    contrast = centred(gray.flatten(1), weight)[1] / weight.sum(-1).sqrt()
+    return torch.maximum(noise_level(gray, kept), LEAST_NOISE * contrast)
+
+
+def _assemble(criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor, centre: Tensor) -> Reference:
+    """Reference from ``images`` (B, 7, h, w): d/dx, d/dy and t, the same blurred, and what of the blurred slopes is
+    texture; the template's ``noise`` (B,) and weights (1 or B, 1, h, w)."""
+    h, w = images.shape[-2:]
     used = (kept > 0).any(0).flatten()
-    y, x = torch.meshgrid(*(torch.arange(n, device=sharp.device) - (n - 1) / 2 for n in (h, w)), indexing="ij")
+    y, x = torch.meshgrid(*(torch.arange(n, device=images.device) - (n - 1) / 2 for n in (h, w)), indexing="ij")
     pixels = torch.stack((x.flatten()[used], y.flatten()[used], torch.ones_like(x.flatten()[used])))
     (left, top), (right, bottom) = pixels[:2].amin(-1).tolist(), pixels[:2].amax(-1).tolist()
     box = pixels.new_tensor([[left, right, right, left], [top, top, bottom, bottom], [1, 1, 1, 1]])
     weight = kept.flatten(1)[:, used]
     local = pixels[:2] - centre[:, :, None]
-    signal, instrument = (_steepest_descent(image.flatten(2)[:, :, used], local) for image in (sharp, soft))
-    radius = (local.norm(dim=1) * (weight > 0)).amax(-1).to(pose_dtype(sharp.device))
-    contrast = centred(signal[:, 3], weight)[1] / weight.sum(-1).sqrt()
-    noise = torch.maximum(noise_level(sharp[:, 2:], kept), LEAST_NOISE * contrast)
-    trust = texture_share(soft[:, :2], noise).flatten(1)[:, used]
-    instrument = torch.cat((instrument[:, :3] * trust[:, None], instrument[:, 3:]), 1)
-    nothing, no_alias = radius.new_zeros(len(sharp), 3, 3), radius.new_zeros(len(sharp), len(ALIASING), 3, 2)
+    sharp, soft, trust = images.flatten(2)[:, :, used].split((3, 3, 1), 1)
+    signal, instrument = _steepest_descent(sharp, local), _steepest_descent(soft, local)
+    instrument = torch.cat((instrument[:, :3] * trust, instrument[:, 3:]), 1)
+    radius = (local.norm(dim=1) * (weight > 0)).amax(-1).to(pose_dtype(images.device))
+    nothing, no_alias = radius.new_zeros(len(images), 3, 3), radius.new_zeros(len(images), len(ALIASING), 3, 2)
     column, row = ((pixels[:2] - box[:2, :1]) / BLOCK).long()
     _, block, block_sizes = torch.unique(row * w + column, return_inverse=True, return_counts=True)
-    constants = (pixels, box, block, block_sizes, centre, radius, noise, signal, instrument, trust, weight, no_alias)
+    constants = (
+        pixels,
+        box,
+        block,
+        block_sizes,
+        centre,
+        radius,
+        noise,
+        signal,
+        instrument,
+        trust[:, 0],
+        weight,
+        no_alias,
+    )
     return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing, nothing, radius), weight > 0)
 
 
