@@ -34,6 +34,17 @@ def test_the_library_block_runs():
     assert names["track"].pose.shape == (30, 1, 3)
 
 
+def test_the_search_block_runs():
+    names: dict[str, object] = {}
+    exec(BLOCKS[0], names)
+    frames = names["frames"]
+    names |= {"templates": frames[:1, None, 200:321, 280:401], "images": frames[1:2, None]}
+    names["reference"] = te.prepare(names["templates"])
+    exec(next(block for block in BLOCKS if "te.locate" in block), names)
+    assert names["found"].status == te.Status.CONVERGED
+    assert not names["found"].ambiguous
+
+
 def test_first_screen():
     """One sentence, one picture, the two commands and an example before anything else."""
     first = README[: README.index("## ")]

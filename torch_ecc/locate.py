@@ -25,8 +25,12 @@ from torch_ecc.solver import Settings, State, stage, warps
 LEVELS = 8  # of a pyramid at most: it ends where the template gets too small
 SMALLEST_FRAME = 12  # px: a frame is not halved below this side
 CANDIDATES = 192  # local maxima of the correlation that are looked at, if so many are nearly as high as the best one
-HANDICAP = 0.25  # of correlation: what the best place may lack on the grid of pixels and turns
-FEWEST = 16  # of them, however low: the runner-up is among them
+HANDICAP = (
+    0.25,
+    0.1,
+)  # of correlation: what the best place may lack on the grid of pixels and turns; once it is aligned
+HOPELESS = 0.3  # correlation of what needs no closer look
+FEWEST = 6  # candidates that are looked at, however low
 SURVIVORS = 16  # of them, brought to the next level
 FINALISTS = 3  # of them, brought to the answer
 COARSE_ITERATIONS = 6
@@ -151,7 +155,7 @@ class Locator:
         references, bank = self.pyramids[b], self.banks[b]
         top = len(references) - 1
         pose, score = bank.candidates(images[top][0, 0], CANDIDATES)
-        pose = pose[foremost(pose, score, references[top].radius, NEIGHBOURS)]
+        pose = pose[foremost(pose, score, references[top].radius, NEIGHBOURS, HANDICAP[0])]
         for level in range(top, min(top, 1) - 1, -1):  # the last level is left to the refinement
             pose = descend(references[level], images[level], pose)
             pose = pose * pose.new_tensor((2.0, 2.0, 1.0)) if level else pose
@@ -172,7 +176,7 @@ def descend(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
     state = stage(copies, image, State.start(copies, pose), "bilinear", COARSE_TOLERANCE, COARSE_ITERATIONS)
     before, after = likeness(copies, image, pose), likeness(copies, image, state.pose)
     pose = torch.where((after > before)[:, None], state.pose, pose)
-    return pose[foremost(pose, torch.maximum(before, after), reference.radius, DISTINCT)[:SURVIVORS]]
+    return pose[foremost(pose, torch.maximum(before, after), reference.radius, DISTINCT, HANDICAP[1])[:SURVIVORS]]
 
 
 def likeness(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
@@ -198,11 +202,11 @@ def distinct(pose: Tensor, score: Tensor, radius: Tensor, apart: float = DISTINC
     return order[~same.tril(-1).any(-1)]
 
 
-def foremost(pose: Tensor, score: Tensor, radius: Tensor, apart: float) -> Tensor:
-    """``distinct`` of those whose score (K,) does not fall behind the best one's by more than a better place between
-    pixels and turns can make up for; CANDIDATES at most, the runner-up among them."""
+def foremost(pose: Tensor, score: Tensor, radius: Tensor, apart: float, behind: float) -> Tensor:
+    """``distinct`` of those whose score (K,) is not too low, nor more than ``behind`` the best one; CANDIDATES at most,
+    and at least FEWEST before duplicates are dropped, so that a runner-up is among them."""
     top, first = score.topk(min(2 * CANDIDATES, len(score)))
-    hopeful = top >= top[0] - HANDICAP
+    hopeful = top >= (top[0] - behind).clamp(min=HOPELESS)
     hopeful[:FEWEST] = True
     first = first[hopeful]
     return first[distinct(pose[first], score[first], radius, apart)[:CANDIDATES]]
