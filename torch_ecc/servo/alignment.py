@@ -1,0 +1,103 @@
+"""The alignment of section V in three steps: detect both parts, servo the substrate, servo the probe to its landing.
+
+1. Detect the poses of the probe and of the substrate in one frame.
+2. Servo the substrate to the desired pose.
+3. Servo the probe so that its tip is at its landing point, a point of the substrate, where that is now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+
+from torch_ecc.estimate import Estimate
+from torch_ecc.pose import transform
+from torch_ecc.servo.control import Control
+from torch_ecc.servo.jacobian import Jacobian
+from torch_ecc.servo.loop import Observer, servo
+from torch_ecc.servo.plant import Plant
+from torch_ecc.servo.record import Ending, Result, Step
+from torch_ecc.tracker import Tracker
+
+Point: TypeAlias = tuple[float, float]
+Detect: TypeAlias = Callable[[Tracker, Tensor], None]
+"""Find the template of a tracker in a frame, wherever it is, and let the tracker go on from there."""
+
+
+class Part(NamedTuple):
+    """A part on its stage: the ``plant`` that moves it, the ``tracker`` of one template on it, taught on an earlier
+    picture, and the image Jacobian; ``point`` (x', y') px of the template: the probe's tip, the substrate's landing."""
+
+    plant: Plant
+    tracker: Tracker
+    jacobian: Jacobian
+    point: Point
+
+
+class Alignment(NamedTuple):
+    """``detected`` poses (2, 3) of substrate and probe; the results of steps 2 and 3 (None if it did not come to it);
+    ``miss`` (2,) px from the landing point to the tip in the last frame, as measured."""
+
+    detected: Tensor
+    substrate: Result
+    probe: Result | None
+    miss: Tensor
+
+    @property
+    def ending(self) -> Ending:
+        """How the last step that was begun ended."""
+        return self.substrate.ending if self.probe is None else self.probe.ending
+
+    @property
+    def aligned(self) -> bool:
+        """Did all steps reach their goal?"""
+        return self.probe is not None and self.probe.aligned
+
+
+def align_parts(
+    substrate: Part,
+    probe: Part,
+    desired: Tensor | Sequence[float],
+    *,
+    detect: Detect,
+    control: Control | None = None,
+    observe: Observer | None = None,
+) -> Alignment:
+    """Bring the substrate to ``desired`` (3,) px, px, rad, and then the probe's tip over its landing point.
+
+    Both parts are tracked all the time: ``observe(frame, estimate, step)`` gets both, the substrate first, and the step
+    of the one that moves. Raises ValueError as ``servo`` does, and what ``detect`` raises.
+    """
+    frame = substrate.plant.frame()
+    for part in (substrate, probe):
+        detect(part.tracker, frame)
+    detected = torch.cat((substrate.tracker.pose, probe.tracker.pose)).cpu()
+    poses = [detected[:1], detected[1:]]
+
+    def both(moving: int) -> Observer:
+        still = (substrate, probe)[1 - moving].tracker
+
+        def watch(frame: Tensor, estimate: Estimate, step: Step) -> None:
+            pair = [estimate, still(frame)] if moving == 0 else [still(frame), estimate]
+            poses[:] = [one.pose.cpu() for one in pair]
+            if observe is not None:
+                observe(frame, Estimate(*(torch.cat(v) for v in zip(*pair, strict=True))), step)
+
+        return watch
+
+    def landing() -> Tensor:
+        return transform(poses[0], torch.tensor([[substrate.point]], dtype=torch.float64))[0, 0]
+
+    def tip() -> Tensor:
+        return transform(poses[1], torch.tensor([[probe.point]], dtype=torch.float64))[0, 0]
+
+    first = servo(substrate.plant, substrate.tracker, desired, substrate.jacobian, control=control, observe=both(0))
+    if not first.aligned:
+        return Alignment(detected, first, None, tip() - landing())
+    theta = poses[1][0, 2:]
+    goal = torch.cat((landing() - tip() + poses[1][0, :2], theta))
+    second = servo(probe.plant, probe.tracker, goal, probe.jacobian, control=control, observe=both(1))
+    return Alignment(detected, first, second, tip() - landing())

@@ -1,0 +1,138 @@
+"""The servo loop: frame, pose, velocity, until the part is where it should be, or something is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from torch_ecc.estimate import Estimate, Status
+from torch_ecc.pose import transform, unwrap
+from torch_ecc.servo.control import Control, Controller
+from torch_ecc.servo.jacobian import Jacobian, planned_move, pseudo_inverse
+from torch_ecc.servo.plant import Plant, read_limits
+from torch_ecc.servo.record import Ending, Log, Result, Step
+from torch_ecc.servo.watch import Watch
+from torch_ecc.tracker import Tracker
+
+Observer: TypeAlias = Callable[[Tensor, Estimate, Step], None]
+UNREACHABLE = 20.0  # tolerances: a component that no axis moves must not be further off than that
+
+
+def servo(
+    plant: Plant,
+    tracker: Tracker,
+    desired: Tensor | Sequence[float],
+    jacobian: Jacobian,
+    *,
+    control: Control | None = None,
+    observe: Observer | None = None,
+) -> Result:
+    """Drive the first template of ``tracker`` to the pose ``desired`` (3,) px, px, rad, by eqs. (12) and (13).
+
+    ``jacobian``: the image Jacobian, ``StageJacobian`` for instance, right in sign and roughly in size. theta takes
+    the shorter way round. ``observe(frame, estimate, step)`` is called after each command. Whatever happens, an error
+    in here included, the last command is velocity zero (it alone may exceed the acceleration).
+
+    What goes wrong on the way: a lost target or a repeated frame brakes the stage; it goes on when the target is seen
+    again, and ends after ``control.patience`` frames. A stage that does not follow and an error that grows end it, too.
+    Ctrl-C returns what was done, as INTERRUPTED.
+
+    Raises ValueError before anything moves if the desired pose is outside the view or beyond what the axes and their
+    travel reach, or if L is singular.
+    """
+    control, goal = control or Control(), _as_pose(desired)
+    speed, acceleration, travel = read_limits(plant)
+    _check_view(tracker, goal)
+    run = _Run(tracker, goal, Controller(jacobian, control, (speed, acceleration), plant.period), travel)
+    steps: list[Step] = []
+    ending: Ending | None = None
+    try:
+        while ending is None:
+            frame = plant.frame()
+            estimate = tracker(frame)
+            velocity, error, ending = run.step(frame, estimate)
+            plant.command(velocity)
+            pose, score, status = run.pose, float(estimate.score[0]), int(estimate.status[0])
+            steps.append(Step(len(steps) * plant.period, pose, error, velocity, score, status))
+            if observe is not None:
+                observe(frame, estimate, steps[-1])
+            if ending is None and len(steps) == control.max_frames:
+                ending = Ending.TIME_OUT
+    except KeyboardInterrupt:
+        ending = Ending.INTERRUPTED
+    finally:
+        plant.command(torch.zeros_like(speed))
+    return Result(ending, Log.of(steps, len(speed)))
+
+
+class _Run:
+    """One run: the controller, its watch and the last good pose."""
+
+    def __init__(self, tracker: Tracker, goal: Tensor, controller: Controller, travel: Tensor | None) -> None:
+        self.goal, self.controller, self.travel = goal, controller, travel
+        self.watch = Watch(controller.control, float(tracker.references[0].radius[0]))
+        self.pose, self._fresh, self._started = goal, False, False
+
+    def step(self, frame: Tensor, estimate: Estimate) -> tuple[Tensor, Tensor, Ending | None]:
+        """The velocity (n,) for a frame, the error (3,) in it and whether this is the end."""
+        before, good = self.pose, bool(Status.good(estimate.status[0]))
+        pose = self.pose = estimate.pose[0].detach().double().cpu()
+        self.watch.seen(good)
+        if good and not self._started:
+            self._begin(pose)
+        repeated = self.watch.repeated(frame, self.controller.shown(pose))
+        error, fresh, self._fresh = pose - self.goal, self._fresh, good and not repeated
+        if not self._fresh:
+            return self.controller.hold(), error, self.watch.faults()
+        if fresh:
+            self.watch.went(self.controller.shown(before), pose - before)
+            self.controller.observe(pose, before, self.watch.radius)
+        ending = self.watch.judge(self._reachable(error), estimate.sigma[0].double().cpu())
+        velocity = self.controller.steer(pose, self.goal) if ending is None else self.controller.hold()
+        return velocity, error, ending
+
+    def _begin(self, pose: Tensor) -> None:
+        """The first pose: choose the turn of theta, and refuse what cannot be reached."""
+        self.goal = torch.cat((self.goal[:2], unwrap(self.goal[2:], pose[2:])))
+        error = pose - self.goal
+        rest, allowed = error - self._reachable(error), UNREACHABLE * self.watch.tolerance
+        for name, left, most in zip(("x", "y", "theta"), rest.tolist(), allowed.tolist(), strict=True):
+            if abs(left) > most:
+                unit = "rad" if name == "theta" else "px"
+                raise ValueError(f"servo: desired pose is unreachable, no axis takes away {left:+.4g} {unit} of {name}")
+        if self.travel is not None:
+            move = planned_move(self.controller.jacobian, pose, self.goal)
+            for k, (way, (low, high)) in enumerate(zip(move.tolist(), self.travel.tolist(), strict=True)):
+                if not low <= way <= high:
+                    raise ValueError(
+                        f"servo: desired pose is unreachable, axis {k} would have to move by {way:.4g} "
+                        f"and can move from {low:.4g} to {high:+.4g} from here"
+                    )
+        self._started = True
+
+    def _reachable(self, error: Tensor) -> Tensor:
+        """The part of an error (3,) that the axes can take away: L L^+ e."""
+        L = self.controller.jacobian(self.goal)
+        return L @ pseudo_inverse(L) @ error
+
+
+def _as_pose(desired: Tensor | Sequence[float]) -> Tensor:
+    pose = torch.as_tensor(desired, dtype=torch.float64).detach().cpu()
+    if pose.shape != (3,) or not bool(pose.isfinite().all()):
+        raise ValueError(f"servo: desired must be three finite numbers (px, px, rad), got {pose.tolist()}")
+    return pose
+
+
+def _check_view(tracker: Tracker, goal: Tensor) -> None:
+    """ValueError if the first template would leave the frame at ``goal`` (3,)."""
+    reference, (height, width) = tracker.references[0], tracker.frame_shape[-2:]
+    corners = reference.box[:2].mT.double().cpu() - reference.centre[0].double().cpu()
+    x, y = transform(goal, corners).unbind(1)
+    if float(x.min()) < 0 or float(y.min()) < 0 or float(x.max()) > width - 1 or float(y.max()) > height - 1:
+        spans = " and ".join(f"{n} = {float(v.min()):.1f} to {float(v.max()):.1f}" for n, v in (("x", x), ("y", y)))
+        raise ValueError(
+            f"servo: desired pose is outside the view, the template would take {spans} px of {width}x{height} px"
+        )
