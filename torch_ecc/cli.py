@@ -172,6 +172,29 @@ def compare(**options: Any) -> None:
     console.print(f"In {job.out}/: comparison.json, comparison.png, errors.csv")
 
 
+@app.command()
+@click.argument("config", type=click.Path())
+@click.option("--out", help="Folder for the outputs [default: torch-ecc-servo].")
+@click.option("--overlay/--no-overlay", default=None, help="Write overlay.mp4 [default: yes].")
+def servo(config: str, **options: Any) -> None:
+    """Align a probe with a substrate by visual servoing on the simulated workstation (section V).
+
+    CONFIG is a TOML file such as configs/servo.toml. Exit status 0 only if the probe is where it should be.
+    """
+    from torch_ecc.experiments.servo_session import describe, run_session
+    from torch_ecc.experiments.workcell import ServoJob
+
+    values = read_toml(config)
+    given = {name: value for name, value in options.items() if value is not None}
+    job = ServoJob.read(values | {"align": values.get("align", {}) | given}, folder=Path(config).parent)
+    with Console(stderr=True).status("teaching the templates") as live:
+        run = run_session(job, lambda part, step: live.update(f"{part}  {step}"))
+    for line in describe(job, run):
+        console.print(line)
+    if not run.alignment.aligned:
+        sys.exit(INTERRUPTED if run.alignment.ending.name == "INTERRUPTED" else 1)
+
+
 def _size(text: str) -> int | list[int]:
     parts = text.lower().split("x")
     if not (1 <= len(parts) <= 2 and all(part.strip().isdecimal() for part in parts)):

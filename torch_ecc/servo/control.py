@@ -21,8 +21,8 @@ class Control:
     ``gain``: lambda in 1/s; ``tolerance_px`` of x and y and ``tolerance_deg`` of theta: the mean error of ``dwell``
     frames in a row must keep them, and each of these frames within three standard deviations of its pose; ``delay``:
     frames from the exposure of a frame to the command made from it, as far as known; ``learn``: weight in [0, 1] of
-    Broyden's update of L, 0 for none; ``patience``: frames for which a lost target, a frozen camera or a stage that does
-    not follow is waited for; ``max_frames``: end of the run.
+    Broyden's update of L, 0 for none; ``patience``: frames for which a lost target, a frozen camera or a stage that
+    does not follow is waited for; ``max_frames``: end of the run.
     """
 
     gain: float = 2.0

@@ -50,6 +50,10 @@ class Step(NamedTuple):
     score: float
     status: int
 
+    def __str__(self) -> str:
+        x, y, theta = self.error.tolist()
+        return f"{self.time:6.2f} s   x {x:+9.3f} px   y {y:+9.3f} px   theta {math.degrees(theta):+9.4f} deg"
+
 
 class Log(NamedTuple):
     """The fields of Step over F frames: (F, ...), float64 (status int64)."""
@@ -64,12 +68,15 @@ class Log(NamedTuple):
     @classmethod
     def of(cls, steps: Sequence[Step], axes: int) -> Log:
         """One record of many, or of none, for a stage of ``axes`` axes."""
-        pose, error, velocity = (
-            torch.stack([s[k] for s in steps]) if steps else torch.zeros(0, width, dtype=torch.float64)
-            for k, width in ((1, 3), (2, 3), (3, axes))
-        )
-        time, score = (torch.tensor([s[k] for s in steps], dtype=torch.float64) for k in (0, 4))
+        time = torch.tensor([s.time for s in steps], dtype=torch.float64)
+        score = torch.tensor([s.score for s in steps], dtype=torch.float64)
+        pose, error = _stack([s.pose for s in steps], 3), _stack([s.error for s in steps], 3)
+        velocity = _stack([s.velocity for s in steps], axes)
         return cls(time, pose, error, velocity, score, torch.tensor([s.status for s in steps], dtype=torch.int64))
+
+
+def _stack(rows: Sequence[Tensor], width: int) -> Tensor:
+    return torch.stack(tuple(rows)) if rows else torch.zeros(0, width, dtype=torch.float64)
 
 
 class Result(NamedTuple):

@@ -96,7 +96,7 @@ def from_config(values: Mapping[str, Any], *, folder: Path | str = ".") -> Simul
         if key not in known:
             raise ValueError(f"simulate: unknown key {key!r}, known are {', '.join(known)}")
     folder = Path(folder)
-    camera = _camera(values.get("camera", {}), _light(values.get("light", []), folder), folder)
+    camera = read_camera(values.get("camera", {}), read_light(values.get("light", []), folder), folder)
     poses = _motion(_table(values, "motion", "harmonic"), camera.size, folder)
     template = _template(values.get("template", {}), folder)
     scene = choose(SCENES, _table(values, "scene", "micrograph"), "[scene]", folder=folder)
@@ -128,7 +128,7 @@ def _seed(value: Any) -> int:
     return value
 
 
-def _light(values: Any, folder: Path) -> Light | None:
+def read_light(values: Any, folder: Path) -> Light | None:
     """One [light] table, or several [[light]] that multiply."""
     tables = [values] if isinstance(values, Mapping) else values
     if not isinstance(tables, list):
@@ -137,7 +137,7 @@ def _light(values: Any, folder: Path) -> Light | None:
     return (lights[0] if len(lights) == 1 else Lights(lights)) if lights else None
 
 
-def _camera(values: Any, light: Light | None, folder: Path) -> Camera:
+def read_camera(values: Any, light: Light | None, folder: Path) -> Camera:
     """The camera; ``noise_variance`` may stand for ``noise_sigma``, and bits = "float" for None, which TOML has not."""
     settings = dict(values) if isinstance(values, Mapping) else values
     if isinstance(settings, dict) and "noise_variance" in settings:
