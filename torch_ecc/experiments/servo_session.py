@@ -51,6 +51,7 @@ def run_session(job: ServoJob, progress: Progress = lambda part, step: None) -> 
             progress(name, step)
 
         run = run_alignment(job, alignee, observe)
+    folder.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures(job, alignee, run).items():
         figure.savefig(part(folder, f"{name}.png"), dpi=130, format="png")
         publish(folder, f"{name}.png")
@@ -104,7 +105,7 @@ def pictures(job: ServoJob, alignee: Alignee, run: Run) -> dict[str, Figure]:
 
 def draw_three_steps(job: ServoJob, alignee: Alignee, run: Run) -> Figure:
     """Where both parts were found at first, and where they were after each step."""
-    logs = [step.log for step in run.alignment[1:3] if step is not None]
+    logs = [step.log for step in run.alignment[1:3] if step is not None and len(step.log.time)]
     poses = [run.alignment.detected, *([log.pose[-1] for log in logs])]
     box, landing = square(job.align.size), torch.tensor([alignee.substrate.point], dtype=torch.float64)
     substrate = [poses[0][0]] + [poses[1]] * (len(run.frames) - 1)
@@ -114,7 +115,7 @@ def draw_three_steps(job: ServoJob, alignee: Alignee, run: Run) -> Figure:
         [transform(s, box), transform(p, tip), transform(s, landing)]
         for s, p in zip(substrate, probe[: len(run.frames)], strict=True)
     ]
-    titles = ("(b) detected", "(c) substrate at its desired pose", "(d) tip over its landing point")
+    titles = ("(b) step 1: detected", "(c) step 2: the substrate", "(d) step 3: the probe")
     return draw_steps(run.frames, lines, titles[: len(run.frames)])
 
 

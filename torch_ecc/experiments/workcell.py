@@ -14,8 +14,8 @@ from torch import Tensor
 from torch_ecc.calibration import Calibration
 from torch_ecc.config import build
 from torch_ecc.estimate import Estimate
-from torch_ecc.pose import compose, transform
-from torch_ecc.servo.alignment import Alignment, Detect, Part, align_parts
+from torch_ecc.pose import transform
+from torch_ecc.servo.alignment import Alignment, Part, align_parts
 from torch_ecc.servo.control import Control
 from torch_ecc.servo.jacobian import StageJacobian
 from torch_ecc.servo.record import Step
@@ -23,8 +23,34 @@ from torch_ecc.sim.workcell import TABLES, Workcell, read_workcell
 from torch_ecc.sim.workstation import Workstation
 from torch_ecc.tracker import Tracker
 
+NOISE = {"noise": 0.05}  # um/s, rms error of a velocity
 COVERED = 0.98  # opacity from which a pixel belongs to the probe's template
 Observer = Callable[[Tensor, Estimate, Step], None]
+
+
+def setting(scale: float = 1.0, **changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of configs/servo.toml, with lengths in the picture times ``scale``, and ``changes`` of tables."""
+
+    def px(*values: float) -> list[float]:
+        return [scale * value for value in values]
+
+    axis, axes = px(120, -60), {"x": NOISE, "y": NOISE}
+    values: dict[str, Any] = {
+        "align": {"desired": [*px(250, 240), 0.0], "landing": px(110, 30), "size": 2 * round(60 * scale) + 1},
+        "control": {"gain": 2.0},
+        "belief": {"um_per_px": 0.275 / scale, "axis_angle_deg": 0.0, "axis": axis},
+        "start": {"substrate": [*px(215, 270), 35.0], "probe": px(555, 130), "height": 5.0},
+        "substrate": {"home": px(250, 240), "um_per_px": 0.275 / scale, "axis": axis, **axes},
+        "probe": {"home": px(540, 130), "um_per_px": 0.275 / scale, **axes},
+        "look": {"scale": scale},
+        "scene": {"kind": "micrograph"},
+        "light": [{"kind": "gradient", "x": 0.25, "y": 0.15}],
+        "camera": {"size": [round(480 * scale), round(640 * scale)], "noise_sigma": 2.0},
+    }
+    return {
+        name: values.get(name, {}) | dict(changes.get(name, {})) if name != "light" else values[name]
+        for name in (*values, *(set(changes) - set(values)))
+    }
 
 
 @dataclass(frozen=True)
@@ -124,26 +150,11 @@ def run_alignment(job: ServoJob, alignee: Alignee, observe: Observer | None = No
         if observe is not None:
             observe(frame, estimate, step)
 
-    alignment = align_parts(
-        alignee.substrate, alignee.probe, desired, detect=known(station), control=job.control, observe=watch
-    )
+    alignment = align_parts(alignee.substrate, alignee.probe, desired, control=job.control, observe=watch)
     substrate, probe = station.truth("substrate"), station.truth("probe")
     points = [torch.tensor([part.point], dtype=torch.float64) for part in alignee[1:3]]
     miss = transform(probe, points[1])[0] - transform(substrate, points[0])[0]
     return Run(alignment, substrate - desired, miss, [*frames, last[0]])
-
-
-def known(station: Workstation) -> Detect:
-    """Detection in place of a search: the true pose, half a pixel and a third of a degree off."""
-
-    def detect(tracker: Tracker, frame: Tensor) -> None:
-        truth = torch.stack((station.truth("substrate"), station.truth("probe")))
-        start = tracker.start
-        home = torch.stack([torch.tensor((*m.home, 0.0)) for m in station.mounts.values()]).to(start)
-        part = int((home - start).norm(dim=1).argmin())
-        tracker.pose = compose(truth[part : part + 1], truth.new_tensor([[0.5, -0.5, 0.006]]))
-
-    return detect
 
 
 def probe_mask(station: Workstation, home: Tensor, frame: tuple[int, int], size: int) -> Tensor:

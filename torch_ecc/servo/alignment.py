@@ -13,7 +13,8 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from torch_ecc.estimate import Estimate
+from torch_ecc.estimate import Estimate, Status
+from torch_ecc.locate import locate
 from torch_ecc.pose import transform
 from torch_ecc.servo.control import Control
 from torch_ecc.servo.jacobian import Jacobian
@@ -57,23 +58,37 @@ class Alignment(NamedTuple):
         return self.probe is not None and self.probe.aligned
 
 
+def find(tracker: Tracker, frame: Tensor) -> None:
+    """Search the whole ``frame`` at any angle for the first template of ``tracker``, and start it from there.
+
+    ValueError if it is not there, or could as well be somewhere else.
+    """
+    found = locate(tracker.references[0], frame)
+    words = f"score {float(found.score[0]):.2f}, the next best place {float(found.runner_up_score[0]):.2f}"
+    if not bool(Status.good(found.status[0])):
+        raise ValueError(f"find: the template must be in the frame, nothing there looks like it ({words})")
+    if bool(found.ambiguous[0]):
+        raise ValueError(f"find: the template must be in the frame once, two places look like it ({words})")
+    tracker.pose = found.pose
+
+
 def align_parts(
     substrate: Part,
     probe: Part,
     desired: Tensor | Sequence[float],
     *,
-    detect: Detect,
+    detect: Detect | None = None,
     control: Control | None = None,
     observe: Observer | None = None,
 ) -> Alignment:
     """Bring the substrate to ``desired`` (3,) px, px, rad, and then the probe's tip over its landing point.
 
     Both parts are tracked all the time: ``observe(frame, estimate, step)`` gets both, the substrate first, and the step
-    of the one that moves. Raises ValueError as ``servo`` does, and what ``detect`` raises.
+    of the one that moves. ``detect``: step 1, by default ``find``. Raises ValueError as ``servo`` and ``find`` do.
     """
     frame = substrate.plant.frame()
     for part in (substrate, probe):
-        detect(part.tracker, frame)
+        (detect or find)(part.tracker, frame)
     detected = torch.cat((substrate.tracker.pose, probe.tracker.pose)).cpu()
     poses = [detected[:1], detected[1:]]
 
