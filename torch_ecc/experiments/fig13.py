@@ -1,4 +1,4 @@
-"""Fig. 13: velocities of the axes while the substrate is servoed, decay of the error, wrong beliefs of the controller."""
+"""Fig. 13: velocities while the substrate is servoed, decay of the error, what the controller may get wrong."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.experiments.workcell import Run, ServoJob, prepare_parts, run_alignment, setting
-from torch_ecc.servo.alignment import find
+from torch_ecc.servo.detect import find
 from torch_ecc.servo.loop import servo
 from torch_ecc.servo.record import Ending, Log, Result
 from torch_ecc.sim.axes import Stage

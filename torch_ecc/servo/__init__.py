@@ -1,7 +1,8 @@
 """Visual servoing (section V): a controller that drives any stage to a pose seen in its camera's picture."""
 
-from torch_ecc.servo.alignment import Alignment, Part, align_parts, find
+from torch_ecc.servo.alignment import Alignment, Part, align_parts
 from torch_ecc.servo.control import Control, Controller
+from torch_ecc.servo.detect import find
 from torch_ecc.servo.jacobian import Jacobian, StageJacobian
 from torch_ecc.servo.loop import servo
 from torch_ecc.servo.plant import Limits, Plant

@@ -13,10 +13,10 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from torch_ecc.estimate import Estimate, Status
-from torch_ecc.locate import locate
+from torch_ecc.estimate import Estimate
 from torch_ecc.pose import transform
 from torch_ecc.servo.control import Control
+from torch_ecc.servo.detect import find
 from torch_ecc.servo.jacobian import Jacobian
 from torch_ecc.servo.loop import Observer, servo
 from torch_ecc.servo.plant import Plant
@@ -56,20 +56,6 @@ class Alignment(NamedTuple):
     def aligned(self) -> bool:
         """Did all steps reach their goal?"""
         return self.probe is not None and self.probe.aligned
-
-
-def find(tracker: Tracker, frame: Tensor) -> None:
-    """Search the whole ``frame`` at any angle for the first template of ``tracker``, and start it from there.
-
-    ValueError if it is not there, or could as well be somewhere else.
-    """
-    found = locate(tracker.references[0], frame)
-    words = f"score {float(found.score[0]):.2f}, the next best place {float(found.runner_up_score[0]):.2f}"
-    if not bool(Status.good(found.status[0])):
-        raise ValueError(f"find: the template must be in the frame, nothing there looks like it ({words})")
-    if bool(found.ambiguous[0]):
-        raise ValueError(f"find: the template must be in the frame once, two places look like it ({words})")
-    tracker.pose = found.pose
 
 
 def align_parts(

@@ -22,7 +22,8 @@ class Control:
     frames in a row must keep them, and each of these frames within three standard deviations of its pose; ``delay``:
     frames from the exposure of a frame to the command made from it, as far as known; ``learn``: weight in [0, 1] of
     Broyden's update of L, 0 for none; ``patience``: frames for which a lost target, a frozen camera or a stage that
-    does not follow is waited for; ``max_frames``: end of the run.
+    does not follow is waited for; ``search``: look for a lost target in the whole frame (``find``) once the stage
+    stands; ``max_frames``: end of the run.
     """
 
     gain: float = 2.0
@@ -32,6 +33,7 @@ class Control:
     delay: int = 0
     learn: float = 0.0
     patience: int = 30
+    search: bool = True
     max_frames: int = 1500
 
     def __post_init__(self) -> None:

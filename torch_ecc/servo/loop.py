@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import TypeAlias
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.pose import transform, unwrap
 from torch_ecc.servo.control import Control, Controller
+from torch_ecc.servo.detect import find
 from torch_ecc.servo.jacobian import Jacobian, planned_move, pseudo_inverse
 from torch_ecc.servo.plant import Plant, read_limits
 from torch_ecc.servo.record import Ending, Log, Result, Step
@@ -18,6 +20,7 @@ from torch_ecc.servo.watch import Watch
 from torch_ecc.tracker import Tracker
 
 Observer: TypeAlias = Callable[[Tensor, Estimate, Step], None]
+SEARCH_EVERY = 5  # frames without the target from one search to the next
 UNREACHABLE = 20.0  # tolerances: a component that no axis moves must not be further off than that
 
 
@@ -55,6 +58,7 @@ def servo(
             estimate = tracker(frame)
             velocity, error, ending = run.step(frame, estimate)
             plant.command(velocity)
+            run.search(frame)
             pose, score, status = run.pose, float(estimate.score[0]), int(estimate.status[0])
             steps.append(Step(len(steps) * plant.period, pose, error, velocity, score, status))
             if observe is not None:
@@ -72,7 +76,7 @@ class _Run:
     """One run: the controller, its watch and the last good pose."""
 
     def __init__(self, tracker: Tracker, goal: Tensor, controller: Controller, travel: Tensor | None) -> None:
-        self.goal, self.controller, self.travel = goal, controller, travel
+        self.tracker, self.goal, self.controller, self.travel = tracker, goal, controller, travel
         self.watch = Watch(controller.control, float(tracker.references[0].radius[0]))
         self.pose, self._fresh, self._started = goal, False, False
 
@@ -93,6 +97,13 @@ class _Run:
         ending = self.watch.judge(self._reachable(error), estimate.sigma[0].double().cpu())
         velocity = self.controller.steer(pose, self.goal) if ending is None else self.controller.hold()
         return velocity, error, ending
+
+    def search(self, frame: Tensor) -> None:
+        """Where the target is lost and the stage stands: look for it in the whole frame, now and again."""
+        due = self.watch.lost % SEARCH_EVERY == SEARCH_EVERY - 1
+        if due and self.controller.control.search and not bool(self.controller.velocity.any()):
+            with suppress(ValueError):  # not there, or twice: then it stays lost
+                find(self.tracker, frame)
 
     def _begin(self, pose: Tensor) -> None:
         """The first pose: choose the turn of theta, and refuse what cannot be reached."""

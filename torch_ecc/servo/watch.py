@@ -18,14 +18,17 @@ GROWN, ROOM = 2.0, 20.0  # an error is diverging beyond GROWN times its least va
 
 
 class Watch:
-    """Counts of one run. Lengths are those of a pose difference with rad turned into px at ``radius``."""
+    """Counts of one run. ``lost``: frames in a row without the target.
+
+    Lengths are those of pose differences, with rad turned into px at ``radius``.
+    """
 
     def __init__(self, control: Control, radius: float) -> None:
         self.control, self.radius = control, radius
         theta = math.radians(control.tolerance_deg)
         self.tolerance = torch.tensor((control.tolerance_px, control.tolerance_px, theta), dtype=torch.float64)
         self._last: Tensor | None = None
-        self._lost = self._frozen = self._within = 0
+        self.lost = self._frozen = self._within = 0
         self._least = torch.inf
         self._errors: list[Tensor] = []
         self._ways: list[tuple[Tensor, Tensor]] = []  # expected and seen change of the last frames
@@ -43,7 +46,7 @@ class Watch:
 
     def seen(self, good: bool) -> None:
         """Count the frames without the target."""
-        self._lost = 0 if good else self._lost + 1
+        self.lost = 0 if good else self.lost + 1
         if not good:
             self._ways.clear()
             self._least = torch.inf
@@ -70,7 +73,7 @@ class Watch:
         """The end of the patience with a lost target or a frozen camera."""
         if self._frozen > self.control.patience:
             return Ending.FROZEN
-        return Ending.LOST if self._lost > self.control.patience else None
+        return Ending.LOST if self.lost > self.control.patience else None
 
     def length(self, difference: Tensor) -> float:
         """(3,) px, px, rad -> px."""

@@ -26,8 +26,8 @@ class Axis:
 
     low: float = -150.0
     high: float = 150.0
-    speed: float = 150.0
-    acceleration: float = 1500.0
+    speed: float = 80.0
+    acceleration: float = 500.0
     step: float = 0.001
     lag: float = 0.005
     damping: float | None = None

@@ -1,0 +1,27 @@
+"""Find the template of a tracker anywhere in a frame: step 1 of an alignment, and the way back to a lost target."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_ecc.estimate import Status
+from torch_ecc.locate import locate
+from torch_ecc.pose import unwrap
+from torch_ecc.tracker import Tracker
+
+
+def find(tracker: Tracker, frame: Tensor) -> None:
+    """Search the whole ``frame`` at any angle for the one template of ``tracker``, which goes on from there.
+
+    ValueError if it is not there, or could as well be somewhere else.
+    """
+    found = locate(tracker.references[0], frame)
+    words = f"score {float(found.score[0]):.2f}, the next best place {float(found.runner_up_score[0]):.2f}"
+    if not bool(Status.good(found.status[0])):
+        raise ValueError(f"find: the template must be in the frame, nothing there looks like it ({words})")
+    if bool(found.ambiguous[0]):
+        raise ValueError(f"find: the template must be in the frame once, two places look like it ({words})")
+    theta = unwrap(found.pose[:, 2:], tracker.pose[:, 2:])
+    tracker.pose = torch.cat((found.pose[:, :2], theta), 1)
+    tracker.velocity = torch.zeros_like(tracker.pose)
