@@ -190,7 +190,7 @@ def servo(config: str, **options: Any) -> None:
     with Console(stderr=True).status("teaching the templates") as live:
         run = run_session(job, lambda part, step: live.update(f"{part}  {step}"))
     for line in describe(job, run):
-        console.print(line)
+        console.print(line, soft_wrap=True)
     if not run.alignment.aligned:
         sys.exit(INTERRUPTED if run.alignment.ending.name == "INTERRUPTED" else 1)
 

@@ -27,20 +27,21 @@ WRONG: dict[str, dict[str, Any]] = {
     "camera 3 frames late, unknown": {"microscope": {"delay": 3}},
     "camera 3 frames late, known": {"microscope": {"delay": 3}, "control": {"delay": 3}},
 }
+GAIN, SCALE = 2.0, 0.5  # 1/s; px of the quick runs over those of the others
 QUICK = ("as it is", "scale 20 % too large, axes 5 deg off")
 
 
 def run(quick: bool, advance: Advance) -> Outcome:
     """A run without noise, and one for each wrong belief; ``quick``: only one of these, at half the resolution."""
-    scale, names = (0.5, QUICK) if quick else (1.0, tuple(WRONG))
-    clean = single(scale, **_scaled(CLEAN, scale))
+    scale, names = (SCALE, QUICK) if quick else (1.0, tuple(WRONG))
+    clean = single(scale, **_changes(CLEAN, scale))
     advance(1, 1 + len(names))
-    gain, runs = 2.0, {}
+    runs = {}
     for number, name in enumerate(names, 2):
-        runs[name] = single(scale, **_scaled(WRONG[name], scale))
+        runs[name] = single(scale, **_changes(WRONG[name], scale))
         advance(number, 1 + len(names))
     rates = decay_rate(clean.result.log.time, clean.result.log.error, largest=0.8, smallest=0.005)
-    off = 100 * (rates / gain - 1).abs()
+    off = 100 * (rates / GAIN - 1).abs()
     usual = runs["as it is"]
     title = ["Substrate"]
     records = [
@@ -61,7 +62,7 @@ def run(quick: bool, advance: Advance) -> Outcome:
             Picture(
                 "fig13", draw_velocities([usual.result.log], title), "Commanded velocities of the substrate's axes."
             ),
-            Picture("fig13_decay", draw_errors([clean.result.log], ["Without noise"], gain), "Errors without noise."),
+            Picture("fig13_decay", draw_errors([clean.result.log], ["Without noise"], GAIN), "Errors without noise."),
         ],
         [Table("What the controller believes", _HEADER, [_row(name, r) for name, r in runs.items()], _NOTE)],
         records,
@@ -92,9 +93,10 @@ def _last(run: Single) -> float:
     return float((velocity[-2] / velocity.amax(0)).max())
 
 
-def _scaled(changes: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
-    """The same changes for pictures of another scale: lengths in px, and um per px."""
+def _changes(changes: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
+    """The same changes for pictures of another scale (lengths in px, and um per px), and lambda."""
     tables = {name: dict(table) for name, table in changes.items()}
+    tables["control"] = {"gain": GAIN} | tables.get("control", {})
     if "start" in tables:
         x, y, deg = tables["start"]["substrate"]
         tables["start"]["substrate"] = [scale * x, scale * y, deg]

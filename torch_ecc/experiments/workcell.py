@@ -43,6 +43,7 @@ def setting(scale: float = 1.0, **changes: Mapping[str, Any]) -> dict[str, Any]:
         "substrate": {"home": px(250, 240), "um_per_px": 0.275 / scale, "axis": axis, **axes},
         "probe": {"home": px(540, 130), "um_per_px": 0.275 / scale, **axes},
         "look": {"scale": scale},
+        "microscope": {},
         "scene": {"kind": "micrograph"},
         "light": [{"kind": "gradient", "x": 0.25, "y": 0.15}],
         "camera": {"size": [round(480 * scale), round(640 * scale)], "noise_sigma": 2.0},
