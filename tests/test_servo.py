@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 import torch
 from servo_bench import Turntable, jacobian
 
+import torch_ecc
 from torch_ecc.experiments.servo_trials import random_start, single, trial
 from torch_ecc.experiments.workcell import setting
+from torch_ecc.pose import rotation
 from torch_ecc.servo import Control, Ending, decay_rate, find, servo
 
+README = Path(__file__).parents[1] / "README.md"
 DESIRED = (90.0, 52.0, 0.1)
 FAST = Control(gain=5.0, patience=12, max_frames=150)
 WAVES = {"kind": "waves", "count": 30}
@@ -180,6 +185,30 @@ def test_a_template_that_is_not_there_is_not_found():
     tracker = plant.tracker()
     with pytest.raises(ValueError, match="find: the template must be in the frame, nothing there looks like it"):
         find(tracker, torch.rand(120, 160, generator=torch.Generator().manual_seed(0)) * 255)
+
+
+def test_the_example_of_the_readme_drives_a_stage(capsys):
+    """The README's own code, with a turntable's driver in place of the user's camera and stage."""
+
+    class Camera:
+        def grab(self):
+            return table.frame().numpy()
+
+    class Stage:
+        def set_velocity(self, *velocity: float) -> None:
+            turn = rotation(table.position[2]).mT  # this driver takes velocities along the picture's axes
+            table.command(torch.cat((turn @ torch.tensor(velocity[:2]).double(), torch.tensor(velocity[2:]).double())))
+
+    table = Turntable((0.0, 0.0, 0.0))
+    (code,) = [b for b in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL) if "set_velocity" in b]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 20
+    table.period = 1 / 30
+    exec(code, {"torch": torch, "te": torch_ecc, "camera": Camera(), "stage": Stage()})
+    assert "The part is at the desired pose and stays there. After" in capsys.readouterr().out
+    x, y, theta = (table.pose - torch.tensor([95.0, 50.0, 0.4], dtype=torch.float64)).tolist()
+    assert math.hypot(x, y) < 0.1
+    assert math.degrees(abs(theta)) < 0.05
+    assert stopped(table)
 
 
 def run(**changes: object):

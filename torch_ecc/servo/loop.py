@@ -56,15 +56,12 @@ def servo(
         while ending is None:
             frame = plant.frame()
             estimate = tracker(frame)
-            velocity, error, ending = run.step(frame, estimate)
-            plant.command(velocity)
+            step, ending = run.step(frame, estimate)
+            plant.command(step.velocity)
+            steps.append(step)
             run.search(frame)
-            pose, score, status = run.pose, float(estimate.score[0]), int(estimate.status[0])
-            steps.append(Step(len(steps) * plant.period, pose, error, velocity, score, status))
             if observe is not None:
-                observe(frame, estimate, steps[-1])
-            if ending is None and len(steps) == control.max_frames:
-                ending = Ending.TIME_OUT
+                observe(frame, estimate, step)
     except KeyboardInterrupt:
         ending = Ending.INTERRUPTED
     finally:
@@ -78,25 +75,29 @@ class _Run:
     def __init__(self, tracker: Tracker, goal: Tensor, controller: Controller, travel: Tensor | None) -> None:
         self.tracker, self.goal, self.controller, self.travel = tracker, goal, controller, travel
         self.watch = Watch(controller.control, float(tracker.references[0].radius[0]))
-        self.pose, self._fresh, self._started = goal, False, False
+        self.pose, self.frames, self._fresh, self._started = goal, 0, False, False
 
-    def step(self, frame: Tensor, estimate: Estimate) -> tuple[Tensor, Tensor, Ending | None]:
-        """The velocity (n,) for a frame, the error (3,) in it and whether this is the end."""
+    def step(self, frame: Tensor, estimate: Estimate) -> tuple[Step, Ending | None]:
+        """What follows from a frame, and whether this is the end."""
         before, good = self.pose, bool(Status.good(estimate.status[0]))
         pose = self.pose = estimate.pose[0].detach().double().cpu()
         self.watch.seen(good)
         if good and not self._started:
             self._begin(pose)
         repeated = self.watch.repeated(frame, self.controller.shown(pose))
-        error, fresh, self._fresh = pose - self.goal, self._fresh, good and not repeated
-        if not self._fresh:
-            return self.controller.hold(), error, self.watch.faults()
-        if fresh:
+        fresh, self._fresh = self._fresh, good and not repeated
+        if self._fresh and fresh:
             self.watch.went(self.controller.shown(before), pose - before)
             self.controller.observe(pose, before, self.watch.radius)
-        ending = self.watch.judge(self._reachable(error), estimate.sigma[0].double().cpu())
-        velocity = self.controller.steer(pose, self.goal) if ending is None else self.controller.hold()
-        return velocity, error, ending
+        error = pose - self.goal
+        sigma = estimate.sigma[0].double().cpu()
+        ending = self.watch.judge(self._reachable(error), sigma) if self._fresh else self.watch.faults()
+        stop = ending is not None or not self._fresh
+        velocity = self.controller.hold() if stop else self.controller.steer(pose, self.goal)
+        time, self.frames = self.frames * self.controller.period, self.frames + 1
+        if ending is None and self.frames == self.controller.control.max_frames:
+            ending = Ending.TIME_OUT
+        return Step(time, pose, error, velocity, float(estimate.score[0]), int(estimate.status[0])), ending
 
     def search(self, frame: Tensor) -> None:
         """Where the target is lost and the stage stands: look for it in the whole frame, now and again."""
