@@ -13,8 +13,8 @@ from torch_ecc.calibration import Calibration
 from torch_ecc.pose import compose, inverse, transform
 from torch_ecc.servo import StageJacobian
 from torch_ecc.sim import Camera, PlaneWaves
+from torch_ecc.sim.axes import Axis, MultiAxisStage
 from torch_ecc.sim.probe import Probe
-from torch_ecc.sim.axes import Axis, Stage
 from torch_ecc.sim.workstation import Microscope, Mount, Workstation
 
 SCENE = PlaneWaves.random(30, seed=3)
@@ -27,7 +27,7 @@ def ten(*values: float) -> torch.Tensor:
 
 def test_lag_of_first_order():
     """T u' + u = c from rest: u = c (1 - e^(-t/T)), q = c t - c T (1 - e^(-t/T))."""
-    stage, lag, c, t = Stage([Axis(lag=0.2, **FREE)], [1.0]), 0.2, 30.0, 0.37
+    stage, lag, c, t = MultiAxisStage([Axis(lag=0.2, **FREE)], [1.0]), 0.2, 30.0, 0.37
     stage.advance(ten(c), t)
     rise = 1 - math.exp(-t / lag)
     assert float(stage.velocity) == pytest.approx(c * rise, rel=1e-12)
@@ -37,7 +37,7 @@ def test_lag_of_first_order():
 def test_lag_of_second_order():
     """An underdamped lag overshoots as the textbook's step response says."""
     lag, zeta, c, t = 0.1, 0.4, 20.0, 0.25
-    stage = Stage([Axis(lag=lag, damping=zeta, **FREE)], [0.0])
+    stage = MultiAxisStage([Axis(lag=lag, damping=zeta, **FREE)], [0.0])
     stage.advance(ten(c), t)
     w = 1 / lag
     wd = w * math.sqrt(1 - zeta**2)
@@ -54,7 +54,7 @@ def test_lag_of_second_order():
 )
 def test_time_may_be_cut_anywhere(lag, damping, cut, c):
     axis = Axis(lag=lag, damping=damping, **FREE)
-    whole, parts = Stage([axis], [0.0]), Stage([axis], [0.0])
+    whole, parts = MultiAxisStage([axis], [0.0]), MultiAxisStage([axis], [0.0])
     whole.advance(ten(c), 0.5)
     parts.advance(ten(c), 0.5 * cut)
     parts.advance(ten(c), 0.5 * (1 - cut))
@@ -63,7 +63,7 @@ def test_time_may_be_cut_anywhere(lag, damping, cut, c):
 
 
 def test_end_stops_speed_and_steps():
-    stage = Stage([Axis(low=-1, high=1, speed=2.0, lag=0.0, step=0.25)], [0.0])
+    stage = MultiAxisStage([Axis(low=-1, high=1, speed=2.0, lag=0.0, step=0.25)], [0.0])
     stage.advance(ten(100.0), 0.2)  # cut to 2 um/s: 0.4 um, shown as a whole number of steps
     assert stage.position.tolist() == [0.5]
     assert stage.velocity.tolist() == [2.0]
@@ -77,7 +77,7 @@ def test_end_stops_speed_and_steps():
 
 def test_noise_is_there_only_while_moving():
     axis = Axis(noise=0.5, lag=0.0, step=0.0, low=-1e6, high=1e6)
-    stage = Stage([axis] * 400, [0.0] * 400, seed=1)
+    stage = MultiAxisStage([axis] * 400, [0.0] * 400, seed=1)
     stage.advance(torch.zeros(400), 1.0)
     assert not stage.position.any()
     stage.advance(torch.full((400,), 10.0), 1.0)
@@ -182,8 +182,8 @@ def test_defocus_blurs_the_probe_alone():
         (lambda: Axis(acceleration=-1), "acceleration must be > 0, got -1"),
         (lambda: Axis(lag=-0.1), "lag must be >= 0, got -0.1"),
         (lambda: Axis(damping=0), "damping must be > 0 or None, got 0"),
-        (lambda: Stage([Axis()], [0.0, 1.0]), r"one value per axis \(1\), got \(2,\)"),
-        (lambda: Stage([Axis()], [200.0]), "axis 0 reaches from -150 to 150, got position 200"),
+        (lambda: MultiAxisStage([Axis()], [0.0, 1.0]), r"one value per axis \(1\), got \(2,\)"),
+        (lambda: MultiAxisStage([Axis()], [200.0]), "axis 0 reaches from -150 to 150, got position 200"),
         (lambda: Mount(home=(0, 0), um_per_px=0), "um_per_px must be > 0, got 0"),
         (lambda: Microscope(period=0), "period must be > 0 s, got 0"),
         (lambda: Microscope(delay=-1), "delay must be >= 0 frames, got -1"),

@@ -16,7 +16,7 @@ from torch_ecc.experiments.report import write_report
 from torch_ecc.experiments.result import Advance, Outcome, environment, load_records, save_records
 from torch_ecc.io.output import check_folder, part, publish
 
-NAMES = ("fig2", "fig3", "fig4", "table1", *(f"fig{n}" for n in range(6, 12)), "robustness")
+NAMES = ("fig2", "fig3", "fig4", "table1", *(f"fig{n}" for n in range(6, 14)), "robustness")
 RECORDS = "records.json"
 DPI = 130
 

@@ -13,7 +13,7 @@ from torch_ecc.experiments.workcell import Run, ServoJob, prepare_parts, run_ali
 from torch_ecc.servo.detect import find
 from torch_ecc.servo.loop import servo
 from torch_ecc.servo.record import Ending, Log, Result
-from torch_ecc.sim.axes import Stage
+from torch_ecc.sim.axes import MultiAxisStage
 
 
 class Trial(NamedTuple):
@@ -65,7 +65,7 @@ def trial(values: Mapping[str, Any]) -> Trial:
     )
 
 
-def shares(log: Log, stage: Stage, period: float) -> tuple[float, float]:
+def shares(log: Log, stage: MultiAxisStage, period: float) -> tuple[float, float]:
     """Largest commanded velocity and acceleration of a log as parts of the stage's limits."""
     speed, acceleration, _ = (v[[0, 1, 3] if log.velocity.shape[1] == 3 else [0, 1]] for v in stage.limits)
     change = torch.diff(log.velocity, dim=0, prepend=torch.zeros_like(log.velocity[:1])) / period

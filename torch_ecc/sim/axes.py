@@ -46,16 +46,20 @@ class Axis:
             raise ValueError(f"Axis: damping must be > 0 or None, got {self.damping}")
 
 
-class Stage:
+class MultiAxisStage:
     """The state of n ``axes`` that start at rest at ``position`` (n,); ``seed`` is that of their noise."""
 
     def __init__(self, axes: Sequence[Axis], position: Sequence[float] | Tensor, *, seed: int = 0) -> None:
         start = torch.as_tensor(position, dtype=torch.float64)
         if start.shape != (len(axes),):
-            raise ValueError(f"Stage: position must have one value per axis ({len(axes)}), got {tuple(start.shape)}")
+            raise ValueError(
+                f"MultiAxisStage: position must have one value per axis ({len(axes)}), got {tuple(start.shape)}"
+            )
         for k, (axis, value) in enumerate(zip(axes, start.tolist(), strict=True)):
             if not axis.low <= value <= axis.high:
-                raise ValueError(f"Stage: axis {k} reaches from {axis.low:g} to {axis.high:g}, got position {value:g}")
+                raise ValueError(
+                    f"MultiAxisStage: axis {k} reaches from {axis.low:g} to {axis.high:g}, got position {value:g}"
+                )
         self.axes = tuple(axes)
         self._state = torch.zeros(len(axes), 4, dtype=torch.float64)
         self._state[:, 0] = start

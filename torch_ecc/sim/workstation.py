@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from torch_ecc.pose import compose, inverse, rotation
+from torch_ecc.sim.axes import Axis, MultiAxisStage
 from torch_ecc.sim.camera import Camera
 from torch_ecc.sim.probe import Probe
 from torch_ecc.sim.scene import Scene
-from torch_ecc.sim.axes import Axis, Stage
 
 Part = Literal["substrate", "probe"]
 ROTARY = Axis(low=-6.5, high=6.5, speed=1.0, acceleration=10.0, step=1e-6)
@@ -162,7 +162,7 @@ class Drive:
         return speed, acceleration, travel
 
     @property
-    def stage(self) -> Stage:
+    def stage(self) -> MultiAxisStage:
         """The stage itself."""
         return self.workstation.stages[self.part]
 
@@ -177,11 +177,13 @@ class Drive:
         self.workstation.command(self.part, whole)
 
 
-def _stage(part: Part, mount: Mount, start: Sequence[float] | Tensor | None, height: float, seed: int) -> Stage:
+def _stage(
+    part: Part, mount: Mount, start: Sequence[float] | Tensor | None, height: float, seed: int
+) -> MultiAxisStage:
     """The stage of a part, at rest where the part is at the pose ``start`` (its home if None)."""
     x, y, theta = (torch.zeros(3) if start is None else mount.position(torch.as_tensor(start).double())).tolist()
     if part == "substrate":
-        return Stage((mount.x, mount.y, mount.z, mount.theta), (x, y, 0.0, theta), seed=seed)
+        return MultiAxisStage((mount.x, mount.y, mount.z, mount.theta), (x, y, 0.0, theta), seed=seed)
     if abs(theta) > 1e-9:
         raise ValueError(f"Workstation: the probe cannot turn, got a start at {theta:g} rad from its home")
-    return Stage((mount.x, mount.y, mount.z), (x, y, height), seed=seed + 1)
+    return MultiAxisStage((mount.x, mount.y, mount.z), (x, y, height), seed=seed + 1)
