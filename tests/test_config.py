@@ -53,7 +53,7 @@ def test_every_default_is_written_in_the_file():
     """configs/track.toml, with its comment signs removed, is exactly the defaults."""
     text = (CONFIGS / "track.toml").read_text()
     written = tomllib.loads(re.sub(r"(?m)^#(\w+ = )", r"\1", text))
-    optional = {"reference", "template", "polygons", "device", "um_per_px", "fps"}  # no default: an example stands there
+    optional = {"reference", "template", "polygons", "device", "um_per_px", "fps"}  # an example stands there
     job = build(TrackJob, written, "track.toml")
     for field in dataclasses.fields(TrackJob):
         assert field.name in written, field.name

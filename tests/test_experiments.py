@@ -209,12 +209,13 @@ def test_limits_are_the_last_level_before_the_first_failure():
 
 
 def test_sweep_short():
-    """A small jump is found by all, one over another part of the circuit by none; the pyramid reaches farther."""
+    """A small jump is found by all, one over another part of the circuit by none but the search of the whole frame;
+    the pyramid reaches farther."""
     changes = [trials.Change(jump=jump, turn=0, size=61) for jump in (0.5, 12, 90)]
     found = trials.sweep(changes, 4, nothing, trackers=True)
     for name in (*trials.METHODS_USED, *trials.TRACKERS):
         assert found.rate[name][0] == 1, name
-        assert found.rate[name][2] == 0, name
+        assert found.rate[name][2] == ("search" in name), name
         assert found.error[name][0] < 0.05, name
     assert found.rate["linear, 3 levels"][1] >= found.rate["linear"][1]
 

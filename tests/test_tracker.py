@@ -307,3 +307,20 @@ def test_a_template_is_found_again_when_partly_outside():
     estimate = Tracker(stack[0], [(20.0, 20.0)], 41)(stack[1])
     assert estimate.status == Status.CONVERGED
     assert (estimate.displacement[0, :2] + 14).abs().max() < 0.02
+
+
+def test_a_wrong_place_that_looks_half_right_is_not_believed():
+    """Cells alike but for a small mark: after a jump by one cell the nearest optimum is the neighbour's."""
+    y, x = torch.meshgrid(torch.arange(240.0), torch.arange(320.0), indexing="ij")
+    cells = 128 + 50 * torch.sin(x * math.tau / 20) * torch.sin(y * math.tau / 20)
+    noise = torch.randn(1, 1, 40, 54, generator=torch.Generator().manual_seed(0))
+    marks = torch.nn.functional.interpolate(noise, (240, 320), mode="bicubic")[0, 0]
+    scene = cells + 18 * marks
+    frames = torch.stack((scene, scene.roll(20, -1)))
+    centers = [(150.0, 120.0)]
+    plain, watchful = (Tracker(frames[0], centers, 61, search=search) for search in (False, True))
+    believed, found = plain(frames[1]), watchful(frames[1])
+    assert Status.good(believed.status)  # it looks like it ...
+    assert abs(float(believed.pose[0, 0]) - 170) > 10  # ... and is not
+    assert found.status == Status.CONVERGED
+    assert found.pose[0, :2].tolist() == pytest.approx([170, 120], abs=0.05)

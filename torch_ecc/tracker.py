@@ -13,7 +13,7 @@ from torch_ecc.align import solve
 from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.estimate import Estimate, Status, Track
 from torch_ecc.frame import as_device, as_gray
-from torch_ecc.locate import LEAST_SEEN, Located, Locator, halvings
+from torch_ecc.locate import LEAST_SEEN, Located, Locator, as_good, halvings
 from torch_ecc.patches import Centers, Size, cut, locate_patches
 from torch_ecc.pose import compose, inverse, unwrap
 from torch_ecc.pyramid import SMALLEST_COARSE, pyramid
@@ -46,8 +46,9 @@ class Tracker(nn.Module):
     "bilinear", "bspline3", "bspline5"; ``tolerance``: px at the template's corner; ``levels``: pyramid levels;
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
-    the frame's); ``min_score``: below it a template is lost; ``search``: look for a lost template in the whole frame,
-    at any angle, in every frame at first and ever more seldom the longer it is gone (every 16th frame in the end).
+    the frame's); ``min_score``: below it a template is lost; ``search``: look for a template that is lost, or looks
+    less like itself than usual, in the whole frame at any angle: in every frame at first, and ever more seldom the
+    longer it stays so (every 16th frame in the end).
     Raises ValueError for what does not fit.
     """
 
@@ -55,7 +56,8 @@ class Tracker(nn.Module):
     velocity: Tensor
     start: Tensor
     score: Tensor
-    missed: Tensor
+    tracked: Tensor
+    doubted: Tensor
 
     def __init__(  # noqa: PLR0913 - the constructor is the list of all choices
         self,
@@ -95,7 +97,8 @@ class Tracker(nn.Module):
         self.register_buffer("pose", start.clone())
         self.register_buffer("velocity", torch.zeros_like(start))
         self.register_buffer("score", expected_score(self.references[0]).to(start.dtype))
-        self.register_buffer("missed", torch.zeros_like(start[:, 0], dtype=torch.int64))  # frames in a row
+        self.register_buffer("tracked", torch.ones_like(start[:, 0], dtype=torch.bool))
+        self.register_buffer("doubted", torch.zeros_like(start[:, 0], dtype=torch.int64))  # frames in a row
         self._locators: dict[int, Locator] = {}  # of the templates last searched for
         self._turn = 0  # whose turn it is if they are many
 
@@ -139,8 +142,7 @@ class Tracker(nn.Module):
         images = [gray]
         estimate = self._solve(images, compose(self.pose, self.velocity))
         if self.search:
-            missing = (estimate.status == Status.LOST) | (estimate.status == Status.OUT_OF_VIEW)
-            for index in self._due(missing):
+            for index in self._due(self._strange(estimate)):
                 estimate = self._search(images, estimate, index)
         return self._advance(estimate)
 
@@ -172,10 +174,14 @@ class Tracker(nn.Module):
             pose = stage(reference, images[level], state, "bilinear", COARSE_TOLERANCE, budget).pose * scale
         return solve(self.references[0], images[0], pose, self.settings)
 
-    def _due(self, missing: Tensor) -> list[int]:
-        """Which of the ``missing`` templates (R,) to search for in this frame."""
-        missed = self.missed.tolist() if bool(missing.any()) else []
-        due = [r for r, n in enumerate(missed) if missing[r] and n % min(2 ** (n // PATIENCE), SELDOM) == 0]
+    def _strange(self, estimate: Estimate) -> Tensor:
+        """Templates that were not found, or look less like themselves than usual: perhaps a wrong place, (R,) bool."""
+        return ~Status.good(estimate.status) | ~as_good(estimate.score, self.score)
+
+    def _due(self, strange: Tensor) -> list[int]:
+        """Which of the ``strange`` templates (R,) to search for in this frame."""
+        doubted = self.doubted.tolist() if bool(strange.any()) else []
+        due = [r for r, n in enumerate(doubted) if strange[r] and n % min(2 ** (n // PATIENCE), SELDOM) == 0]
         if len(due) > AT_ONCE:
             self._turn = (self._turn + AT_ONCE) % len(due)
             due = due[self._turn :] + due[: self._turn]
@@ -197,6 +203,8 @@ class Tracker(nn.Module):
         found, score = locator.candidates(own, 0, self.pose[r])
         if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * self.score[r]:
             return estimate
+        if Status.good(estimate.status[r]) and as_good(estimate.score[r], found.score[0]):
+            return estimate
         best = found._replace(pose=torch.cat((found.pose[:, :2], unwrap(found.pose[:, 2:], self.pose[r, 2])), -1))
         index = torch.tensor([r], device=self.pose.device)
         return Estimate(*(e.index_copy(0, index, f[:1]) for e, f in zip(estimate, best, strict=True)))
@@ -206,8 +214,9 @@ class Tracker(nn.Module):
         pose = torch.where(good, estimate.pose, self.pose)
         if self.prediction == "velocity":
             # The last step in the template's own axes: exact for a constant turn about any point of the stage.
-            self.velocity = torch.where(good & (self.missed == 0)[:, None], compose(inverse(self.pose), pose), 0.0)
-        self.pose, self.missed = pose, torch.where(good[:, 0], 0, self.missed + 1)
+            self.velocity = torch.where(good & self.tracked[:, None], compose(inverse(self.pose), pose), 0.0)
+        self.pose, self.tracked = pose, good[:, 0]
+        self.doubted = torch.where(self._strange(estimate), self.doubted + 1, 0)
         self.score = torch.where(good[:, 0], torch.lerp(self.score, estimate.score, MEMORY), self.score)
         return estimate._replace(pose=pose.clone(), displacement=pose - self.start)
 

@@ -79,11 +79,11 @@ REMARKS = (
     f"Where they are not varied: a jump of {JUMP:g} px in any direction, a turn of {TURN:g} deg, noise of {NOISE:g} "
     "grey levels in template and frame. Every method starts at the pose of the frame before.",
     f"Found: nearer than {FOUND:g} px to the truth at the template's corner. The red line counts what the default "
-    "method calls a good pose and is not: the part of the failures that its status does not tell.",
+    "(over jumps and turns the tracker with its search) calls a good pose and is not: what its status does not tell.",
     "A jump or turn beyond the width of the texture leads into a neighbouring minimum, whatever the criterion, and on "
     "a circuit of many equal cells that minimum often looks good enough to be believed. What widens the basin is the "
-    "pyramid; the search, the tracker's default, catches only what is noticed as lost. The columns for light cost some "
-    "of the basin.",
+    "pyramid. The tracker's search, its default, looks at the whole frame when a template is lost or looks less like "
+    "itself than it did before. The columns for light cost some of the basin.",
     "Contrast is no failure to ECC, which fits a gain: it works until the noise is as large as what is left. SSD takes "
     "a change of contrast for motion. Blur mixes in what lies around the template, which no method here models.",
     "Nor does any model an occluder. A partly covered template is pulled aside and soon refused: below a correlation "
@@ -133,7 +133,7 @@ def _basin(sweeps: Mapping[str, Sweep], found: Mapping[str, Found]) -> Picture:
     panels = [_rates(f"({letter})", sweeps[name], found[name]) for letter, name in zip("ab", BASIN, strict=True)]
     caption = (
         "Basin: how far the start may be from the answer, in (a) position and (b) angle. "
-        '"3 levels" is a pyramid, "search" the tracker\'s search for a lost template, its default.'
+        '"3 levels" is a pyramid, "search" the tracker\'s default, which searches the frame.'
     )
     return Picture("basin", draw_panels(panels), caption)
 

@@ -13,7 +13,7 @@ from torch_ecc.experiments.style import letter, new_figure
 LOOKS = {  # of curves that are no METHODS: colour and dashes
     "linear, 3 levels": ("#0b6e4f", "--"),
     "linear, search": ("#0b6e4f", ":"),
-    "linear: wrong, not noticed": ("#d62728", "-."),
+    "wrong, not noticed": ("#d62728", "-."),
     "bilinear": ("#e69f00", "-"),
     "bspline3": ("#0b6e4f", "-"),
     "bspline5": ("#56b4e9", "--"),
