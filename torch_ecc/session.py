@@ -203,10 +203,8 @@ def refuse_doubt(located: Located, placed: bool) -> None:
         best, other = (_place(*p.tolist()) for p in (located.pose[r], located.runner_up.pose[r]))
         score, second = float(located.score[r]), float(located.runner_up_score[r])
         if not Status.good(located.status[r]):
-            sentence = Status.describe(status)
-            raise ValueError(
-                f"template: number {r} is not in the first frame (best: {best}, score {score:.3f}). {sentence}"
-            )
+            why = f". {Status.describe(status)}" if status == Status.LOW_TEXTURE else ""
+            raise ValueError(f"template: number {r} is not in the first frame (best: {best}, score {score:.3f}){why}")
         if bool(located.ambiguous[r]) and not placed:
             raise ValueError(
                 f"template: number {r} may be at {best} (score {score:.3f}) or at {other} (score {second:.3f}); "
