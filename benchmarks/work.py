@@ -1,0 +1,107 @@
+"""What every tracker is given: frames, where the template is in the first one, the true poses, and the least error."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_ecc.experiments.accuracy import SIZE, Harmonic
+from torch_ecc.experiments.bound import QUANTISATION, cramer_rao
+from torch_ecc.pose import compose
+from torch_ecc.sim import Camera, GradientLight, Pads, PlaneWaves, Scene, Sequence, placed
+
+STANDARD = Harmonic(20.0, 5.0, 40).path(Camera())  # eq. (11): up to 3.1 px in x and in y, 4.4 px together, per frame
+SMALL = Harmonic(5.0, 1.25, 40).path(Camera())  # up to 1.1 px per frame
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """``frames`` (F + 1, 1, H, W) uint8, the template ``size`` px around ``center`` (x, y) of the first one, its
+    ``truth`` (F, 3) px, px, rad in the others, and the Cramer-Rao ``bound`` (3,) if the scene is known."""
+
+    name: str
+    title: str
+    frames: Tensor
+    center: tuple[float, float]
+    size: int
+    truth: Tensor
+    bound: Tensor | None = None
+
+
+def simulated(name: str, title: str, scene: Scene, path: Tensor, camera: Camera) -> Work:
+    """A scene at poses ``path`` (F + 1, 3). The bound counts the noise twice: the template is as noisy."""
+    sequence = Sequence(scene, path, camera)
+    center = sequence.poses[:1, :2]
+    bound = cramer_rao(scene, (SIZE, SIZE), 2 * (camera.noise_sigma**2 + QUANTISATION))
+    x, y = center[0].tolist()
+    return Work(name, title, torch.cat(list(sequence.batches())), (x, y), SIZE, sequence.truth(center)[1:, 0], bound)
+
+
+def waves() -> Scene:
+    """Rich texture: 200 plane waves, amplitudes ~ 1/f up to 0.25 cycles per px, rms gradient 7 grey levels per px."""
+    return PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0)
+
+
+def fine(count: int = 200, fmax: float = 0.25, rms_gradient: float = 7.0) -> Scene:
+    """Fine texture: equal amplitudes, frequencies spread evenly over the disc below ``fmax``."""
+    generator = torch.Generator().manual_seed(0)
+    u, angle, phase = math.tau * torch.rand(3, count, generator=generator, dtype=torch.float64)
+    waves = math.tau * fmax * (u / math.tau).sqrt()[:, None] * torch.stack((angle.cos(), angle.sin()), 1)
+    amplitude = rms_gradient / waves.square().sum().div(4).sqrt()
+    return PlaneWaves(waves, amplitude.expand(count), phase)
+
+
+def jumps(length: float = 4.4, frames: int = 40) -> Tensor:
+    """Poses of a walk by ``length`` px in a random direction per frame, which no prediction helps with."""
+    angle = math.tau * torch.rand(frames, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    walk = (length * torch.stack((angle.cos(), angle.sin(), 0 * angle), -1)).cumsum(0)
+    return placed(torch.cat((0 * walk[:1], walk)), (320.0, 240.0))
+
+
+def noisy(sigma: float) -> Callable[[], Work]:
+    """The standard work with noise of ``sigma`` grey levels."""
+    name = f"noise{sigma:g}"
+    return lambda: simulated(name, f"noise of {sigma:g} grey levels", waves(), STANDARD, Camera(noise_sigma=sigma))
+
+
+WORKS: dict[str, Callable[[], Work]] = {
+    "clean": lambda: simulated("clean", "waves, no noise but rounding", waves(), STANDARD, Camera()),
+    "noise2": noisy(2.0),
+    "noise5": noisy(5.0),
+    "noise10": noisy(10.0),
+    "fine": lambda: simulated("fine", "fine texture, small steps", fine(), SMALL, Camera()),
+    "hard": lambda: simulated("hard", "fine texture, 4.4 px per frame", fine(), STANDARD, Camera()),
+    "jumps": lambda: simulated("jumps", "fine texture, 4.4 px in random directions", fine(), jumps(), Camera()),
+    "pads": lambda: simulated("pads", "wafer-like pads", Pads.wafer(), STANDARD, Camera()),
+    "light": lambda: simulated(
+        "light", "waves, light falling off", waves(), STANDARD, Camera(light=GradientLight(scale_px=640))
+    ),
+}
+
+
+def recorded(folder: Path, size: int | None = None) -> Work:
+    """A sequence of ``data/`` with its known motion: pixel_shift, pyvale_rigid, rotation_full."""
+    facts = json.loads((folder / "truth.json").read_text())
+    images = [folder / "ref.png", *(folder / f["file"] for f in facts["frames"])]
+    frames = torch.from_numpy(np.stack([cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in images]))[:, None]
+    if facts["template_hint"]:
+        x, y, w, h = facts["template_hint"]
+        center, side = (x + (w - 1) / 2, y + (h - 1) / 2), min(w, h)
+    else:
+        center, side = ((frames.shape[-1] - 1) / 2, (frames.shape[-2] - 1) / 2), 201
+    pivot = torch.tensor(facts["centre_px"] or center, dtype=torch.float64)
+    moves = [(pivot[0] + f["tx"], pivot[1] + f["ty"], -math.radians(f["theta_deg"] or 0)) for f in facts["frames"]]
+    offset = torch.tensor([*center, 0.0], dtype=torch.float64) - torch.tensor([*pivot.tolist(), 0.0])
+    moved = torch.tensor(moves, dtype=torch.float64)
+    return Work(folder.name, folder.name, frames, center, size or side, compose(moved, offset.expand_as(moved)))
+
+
+RECORDED = ("pixel_shift", "pyvale_rigid", "rotation_full")
