@@ -1,9 +1,8 @@
-"""The trackers that are compared, each at its best settings, behind one small protocol.
+"""One small protocol for all trackers, and what they need to follow a template from frame to frame.
 
 A tracker is a function ``start(first, center, size)`` that is shown the first frame and the template in it and returns
 a function ``follow(frame)`` with the pose (x, y, theta) in px, px, rad of torch_ecc's convention, or None where it
-gives up. Frames are uint8 tensors (1, H, W). Every peer starts from the previous pose, as torch_ecc does with
-``prediction="hold"``.
+gives up. Frames are uint8 tensors (1, H, W).
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_ecc import Status, Tracker
@@ -22,7 +22,8 @@ from torch_ecc.pose import from_opencv, to_opencv
 Pose = tuple[float, float, float]
 Follow = Callable[[Tensor], Pose | None]
 Start = Callable[[Tensor, tuple[float, float], int], Follow]
-REACH = 80  # px: half the side of the square that is cut around the last pose of a 121 px template
+Image = NDArray[Any]
+Align = Callable[[Image, Image, Image], Image]
 
 
 class Peer(NamedTuple):
@@ -48,31 +49,32 @@ def ours(**options: Any) -> Start:
     return start
 
 
-def opencv(align: Callable[..., np.ndarray], blur: bool, reach: int | None) -> Start:
-    """OpenCV's ECC: ``align(template, image, warp)`` returns the refined 2x3 warp or raises.
+def aligned(make: Callable[[], Align], *, reach: int | None, surround: int = 0, blur: bool = False) -> Start:
+    """A tracker from a function that aligns two images: ``align(template, image, warp)`` returns the 2x3 warp (OpenCV's
+    convention, template pixel -> image pixel) refined from the given one, or raises.
 
-    ``blur``: template and image are blurred 5 x 5 here, before cutting, in float32. ``reach``: align with a square of
-    this half side around the last pose (grown with the template), instead of the whole frame.
+    It is given the square around the last pose that is ``reach`` px wider than the template on every side (None: the
+    whole frame). ``surround``: px of surroundings that the template is cut with. ``blur``: both are blurred first, in
+    float32, 5 x 5.
     """
 
     def start(first: Tensor, center: tuple[float, float], size: int) -> Follow:
         pose = torch.tensor([*center, 0.0], dtype=torch.float64)
-        x, y = (round(c - (size - 1) / 2) for c in center)
-        whole = _blurred(first[0].numpy()) if blur else first[0].numpy()
-        template = np.ascontiguousarray(whole[y : y + size, x : x + size])
+        side, align = size + 2 * surround, make()
+        smooth = _smooth if blur else np.ascontiguousarray
+        template = np.ascontiguousarray(_square(smooth(first[0].numpy()), pose, side)[0])
 
         def follow(frame: Tensor) -> Pose | None:
             nonlocal pose
-            image, (left, top) = frame[0].numpy(), (0, 0)
+            image, corner = frame[0].numpy(), np.zeros((2, 3))
             if reach is not None:
-                image, (left, top) = _around(image, pose, reach + (size - 121 + 1) // 2)
-            warp = to_opencv(pose, (size, size)).numpy() - np.array([[0, 0, left], [0, 0, top]])
+                image, corner = _square(image, pose, size + 2 * reach)
+            warp = to_opencv(pose, (side, side)).numpy() - corner
             try:
-                warp = align(template, _blurred(image) if blur else image, warp.astype(np.float32))
-            except cv2.error:
+                warp = align(template, smooth(image), warp) + corner
+            except (cv2.error, RuntimeError):
                 return None
-            warp = warp.astype(np.float64) + np.array([[0, 0, left], [0, 0, top]])
-            pose = from_opencv(torch.from_numpy(warp), (size, size))
+            pose = from_opencv(torch.from_numpy(warp), (side, side))
             return tuple(pose.tolist())
 
         return follow
@@ -80,37 +82,13 @@ def opencv(align: Callable[..., np.ndarray], blur: bool, reach: int | None) -> S
     return start
 
 
-def ecc(criteria: tuple[int, int, float], gauss: int) -> Callable[..., np.ndarray]:
-    """cv2.findTransformECC; ``gauss``: side of its own blur."""
-    return lambda t, image, warp: cv2.findTransformECC(t, image, warp, cv2.MOTION_EUCLIDEAN, criteria, None, gauss)[1]
-
-
-def ecc_multiscale(t: np.ndarray, image: np.ndarray, warp: np.ndarray) -> np.ndarray:
-    """cv2.findTransformECCMultiScale (OpenCV 5) at its own settings but for the motion."""
-    parameters = cv2.ECCParameters()
-    parameters.motionType = cv2.MOTION_EUCLIDEAN
-    return cv2.findTransformECCMultiScale(t, image, warp, parameters)[1]
-
-
-def _blurred(image: np.ndarray) -> np.ndarray:
+def _smooth(image: Image) -> Image:
     return cv2.GaussianBlur(image.astype(np.float32), (5, 5), 0)
 
 
-def _around(image: np.ndarray, pose: Tensor, reach: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """The square of half side ``reach`` around ``pose``, less what lies outside the image, and its corner (x, y)."""
-    x, y = (round(v) for v in pose[:2].tolist())
-    left, top = max(x - reach, 0), max(y - reach, 0)
-    return np.ascontiguousarray(image[top : y + reach + 1, left : x + reach + 1]), (left, top)
-
-
-def opencv_peers() -> dict[str, Peer]:
-    """Shipped settings on the whole frame; the fastest fair setting (blurred once here, cut out, loose eps)."""
-    count_or_eps = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
-    shipped, loose = (count_or_eps, 50, 1e-3), (count_or_eps, 50, 1e-4)
-    peers = {
-        "OpenCV ECC, shipped": Peer(opencv(ecc(shipped, 5), blur=False, reach=None), "OpenCV"),
-        "OpenCV ECC, fastest fair": Peer(opencv(ecc(loose, 1), blur=True, reach=REACH), "OpenCV"),
-    }
-    if hasattr(cv2, "findTransformECCMultiScale"):
-        peers["OpenCV ECC, multi-scale"] = Peer(opencv(ecc_multiscale, blur=False, reach=REACH), "OpenCV")
-    return peers
+def _square(image: Image, pose: Tensor, side: int) -> tuple[Image, Image]:
+    """The square around ``pose``, moved into the image where it would leave it, and a 2x3 matrix of its corner."""
+    x, y = (round(v - (side - 1) / 2) for v in pose[:2].tolist())
+    h, w = image.shape
+    x, y = max(min(x, w - side), 0), max(min(y, h - side), 0)
+    return image[y : y + side, x : x + side], np.array([[0, 0, x], [0, 0, y]], dtype=np.float64)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import torch
-from adapters import Peer, opencv_peers, ours
+from adapters import Peer, ours
+from rivals import rivals
 
 from torch_ecc import Tracker
 from torch_ecc.sim import PlaneWaves
@@ -20,7 +21,7 @@ VARIANTS = {
 
 
 def backends() -> dict[str, str]:
-    """The backends of the installed library, and why each of the others is left out ('' if it is there)."""
+    """The backends by name, and why the installed library refuses each of them ('' if it does not)."""
     frame = PlaneWaves.random().render(torch.tensor([[32.0, 32.0, 0.0]]), (64, 64))[0]
     found = {}
     for name in ("torch", "native"):
@@ -32,14 +33,16 @@ def backends() -> dict[str, str]:
     return found
 
 
+def options() -> dict[str, dict[str, str]]:
+    """What is asked of a Tracker, by the backend's name; {"": {}} while the library has only one."""
+    return {name: {"backend": name} for name, refused in backends().items() if not refused} or {"": {}}
+
+
 def trackers() -> dict[str, Peer]:
     """All of them. torch_ecc starts from the previous pose like its peers; "default" is as shipped, with prediction."""
-    usable = [name for name, refused in backends().items() if not refused]
     mine = {}
-    for backend in usable or [""]:
-        chosen = {"backend": backend} if backend else {}
-        suffix = f", {backend}" if backend else ""
-        for name, options in VARIANTS.items():
-            mine[f"{name}{suffix}"] = Peer(ours(prediction="hold", **options, **chosen), "torch_ecc")
-    mine["default"] = Peer(ours(), "torch_ecc")
-    return mine | opencv_peers()
+    for backend, chosen in options().items():
+        for name, variant in VARIANTS.items():
+            title = ", ".join(filter(None, (f"torch_ecc {name}", backend)))
+            mine[title] = Peer(ours(prediction="hold", **variant, **chosen), "torch_ecc")
+    return mine | {"torch_ecc default": Peer(ours(), "torch_ecc")} | rivals()

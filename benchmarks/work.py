@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -36,13 +35,22 @@ class Work:
     bound: Tensor | None = None
 
 
-def simulated(name: str, title: str, scene: Scene, path: Tensor, camera: Camera) -> Work:
-    """A scene at poses ``path`` (F + 1, 3). The bound counts the noise twice: the template is as noisy."""
-    sequence = Sequence(scene, path, camera)
-    center = sequence.poses[:1, :2]
-    bound = cramer_rao(scene, (SIZE, SIZE), 2 * (camera.noise_sigma**2 + QUANTISATION))
-    x, y = center[0].tolist()
-    return Work(name, title, torch.cat(list(sequence.batches())), (x, y), SIZE, sequence.truth(center)[1:, 0], bound)
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """A scene at poses ``path`` (F + 1, 3) before a camera, whose noise is drawn anew with every seed."""
+
+    title: str
+    scene: Scene
+    path: Tensor = STANDARD
+    camera: Camera = field(default_factory=Camera)
+
+    def make(self, name: str, seed: int) -> Work:
+        """The frames. The bound counts the noise twice: the template is as noisy."""
+        sequence = Sequence(self.scene, self.path, self.camera, seed)
+        center, frames = self.path[:1, :2], torch.cat(list(sequence.batches()))
+        bound = cramer_rao(self.scene, (SIZE, SIZE), 2 * (self.camera.noise_sigma**2 + QUANTISATION))
+        x, y = center[0].tolist()
+        return Work(name, self.title, frames, (x, y), SIZE, sequence.truth(center)[1:, 0], bound)
 
 
 def waves() -> Scene:
@@ -66,24 +74,16 @@ def jumps(length: float = 4.4, frames: int = 40) -> Tensor:
     return placed(torch.cat((0 * walk[:1], walk)), (320.0, 240.0))
 
 
-def noisy(sigma: float) -> Callable[[], Work]:
-    """The standard work with noise of ``sigma`` grey levels."""
-    name = f"noise{sigma:g}"
-    return lambda: simulated(name, f"noise of {sigma:g} grey levels", waves(), STANDARD, Camera(noise_sigma=sigma))
-
-
-WORKS: dict[str, Callable[[], Work]] = {
-    "clean": lambda: simulated("clean", "waves, no noise but rounding", waves(), STANDARD, Camera()),
-    "noise2": noisy(2.0),
-    "noise5": noisy(5.0),
-    "noise10": noisy(10.0),
-    "fine": lambda: simulated("fine", "fine texture, small steps", fine(), SMALL, Camera()),
-    "hard": lambda: simulated("hard", "fine texture, 4.4 px per frame", fine(), STANDARD, Camera()),
-    "jumps": lambda: simulated("jumps", "fine texture, 4.4 px in random directions", fine(), jumps(), Camera()),
-    "pads": lambda: simulated("pads", "wafer-like pads", Pads.wafer(), STANDARD, Camera()),
-    "light": lambda: simulated(
-        "light", "waves, light falling off", waves(), STANDARD, Camera(light=GradientLight(scale_px=640))
-    ),
+WORKS: dict[str, Simulated] = {
+    "clean": Simulated("waves, only rounded", waves()),
+    "noise2": Simulated("waves, noise of 2", waves(), camera=Camera(noise_sigma=2.0)),
+    "noise5": Simulated("waves, noise of 5", waves(), camera=Camera(noise_sigma=5.0)),
+    "noise10": Simulated("waves, noise of 10", waves(), camera=Camera(noise_sigma=10.0)),
+    "fine": Simulated("fine texture, small steps", fine(), SMALL),
+    "hard": Simulated("fine texture, 4.4 px per frame", fine()),
+    "jumps": Simulated("fine texture, 4.4 px any way", fine(), jumps()),
+    "pads": Simulated("wafer-like pads", Pads.wafer()),
+    "light": Simulated("waves, light falling off", waves(), camera=Camera(light=GradientLight(scale_px=640))),
 }
 
 
@@ -101,7 +101,9 @@ def recorded(folder: Path, size: int | None = None) -> Work:
     moves = [(pivot[0] + f["tx"], pivot[1] + f["ty"], -math.radians(f["theta_deg"] or 0)) for f in facts["frames"]]
     offset = torch.tensor([*center, 0.0], dtype=torch.float64) - torch.tensor([*pivot.tolist(), 0.0])
     moved = torch.tensor(moves, dtype=torch.float64)
-    return Work(folder.name, folder.name, frames, center, size or side, compose(moved, offset.expand_as(moved)))
+    return Work(
+        folder.name, f"real: {folder.name}", frames, center, size or side, compose(moved, offset.expand_as(moved))
+    )
 
 
 RECORDED = ("pixel_shift", "pyvale_rigid", "rotation_full")

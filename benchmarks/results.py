@@ -1,0 +1,68 @@
+"""A benchmark's figures as JSON: name, value, unit, which way is better, tolerance; with versions and machine."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torch_ecc.experiments.result import environment
+
+PEERS = ("opencv-python-headless", "pystackreg", "SimpleITK")
+
+
+class Figure(NamedTuple):
+    """One number. ``better``: "lower" or "higher". ``tolerance``: the share by which a later one may be worse; None if
+    it is only there to be read, as a peer's."""
+
+    name: str
+    value: float
+    unit: str
+    better: str = "lower"
+    tolerance: float | None = None
+
+
+class Result(NamedTuple):
+    """Figures by name, and what they depend on."""
+
+    about: dict[str, str]
+    figures: dict[str, Figure]
+
+
+def save(path: Path, figures: Iterable[Figure], **about: str) -> None:
+    """Write a result. Four digits are kept; a number that is not finite becomes null."""
+    load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
+    facts = environment() | _peers() | {"load": load} | about
+    rows = [figure._replace(value=_kept(figure.value))._asdict() for figure in figures]
+    lines = ",\n".join(f"    {json.dumps(row, allow_nan=False)}" for row in rows)
+    path.write_text(f'{{\n  "about": {json.dumps(facts)},\n  "figures": [\n{lines}\n  ]\n}}\n', encoding="utf-8")
+
+
+def load(path: Path) -> Result:
+    """Read what ``save`` wrote. ValueError for a file that is no result."""
+    try:
+        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        figures = [Figure(**row) for row in document["figures"]]
+        about = dict(document["about"])
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: expected a benchmark's result (about, figures), got {error!r}") from error
+    nan = math.nan
+    return Result(about, {f.name: f if f.value is not None else f._replace(value=nan) for f in figures})
+
+
+def _kept(value: float) -> Any:
+    return float(f"{value:.4g}") if math.isfinite(value) else None
+
+
+def _peers() -> dict[str, str]:
+    found = {}
+    for name in PEERS:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
