@@ -1,19 +1,22 @@
-"""Accuracy on analytic scenes, printed as tables: python benchmarks/accuracy.py [draws].
+"""Accuracy on analytic scenes: python benchmarks/accuracy.py [DRAWS] [--poses N] [--only SECTION]... [--out FILE.json]
 
-Scatter over the Cramer-Rao bound and normalised error squared (template and frame redrawn), sequences of eq. (11), two
-full turns, and uneven light.
+Sections: scatter over the Cramer-Rao bound and normalised error squared (template and frame redrawn); the largest error
+in N random poses; sequences of eq. (11) and two full turns; uneven light.
 """
 
 from __future__ import annotations
 
 import math
-import sys
+from collections.abc import Callable
+from pathlib import Path
 
+import click
 import torch
+from results import Figure, save
 from rich.console import Console
 from rich.table import Table
 
-from torch_ecc.experiments.accuracy import Draws, Harmonic, scatter, track_path, under_light
+from torch_ecc.experiments.accuracy import Draws, Harmonic, Scatter, scatter, track_path, under_light
 from torch_ecc.sim.camera import Camera
 from torch_ecc.sim.light import GradientLight, SpotLight
 from torch_ecc.sim.pads import Pads
@@ -21,6 +24,7 @@ from torch_ecc.sim.sequence import Sequence
 from torch_ecc.sim.waves import PlaneWaves
 
 SCENES = {"waves": PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0), "pads": Pads.wafer()}
+MOTIONS = {False: "shifts only", True: "any angle"}
 console = Console(width=120)
 
 
@@ -31,8 +35,8 @@ def show(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> No
     console.print(table)
 
 
-def scatters(draws: int) -> None:
-    rows = []
+def scatters(draws: int) -> list[Figure]:
+    rows, figures = [], []
     for name, scene in SCENES.items():
         for noise in (0.0, 2.0, 5.0, 10.0):
             for turn in (False, True):
@@ -40,11 +44,21 @@ def scatters(draws: int) -> None:
                 rms = s.error.square().mean(0).sqrt().tolist()
                 cells = [f"{v:.5f}" for v in (rms[0], rms[1], math.degrees(rms[2]))]
                 ratio = " ".join(f"{v:.2f}" for v in s.ratio)
+                title = f"{name}, noise {noise:g}, {MOTIONS[turn]} / worst rms over the bound"
+                figures.append(Figure(title, float(s.ratio.max()), "x", "lower", 0.1))
                 mean = f"{float(s.nees.mean()):.2f}"
                 iterations = f"{float(s.iterations.double().mean()):.1f}"
-                motion = "any angle" if turn else "shifts only"
                 rows.append(
-                    (name, f"{noise:g}", motion, *cells, ratio, mean, iterations, str(int((s.status != 0).sum())))
+                    (
+                        name,
+                        f"{noise:g}",
+                        MOTIONS[turn],
+                        *cells,
+                        ratio,
+                        mean,
+                        iterations,
+                        str(int((s.status != 0).sum())),
+                    )
                 )
     header = (
         "scene",
@@ -59,38 +73,81 @@ def scatters(draws: int) -> None:
         "not converged",
     )
     show(f"Scatter, {draws} redrawn pairs (chance: {1 / math.sqrt(2 * draws):.0%} of an rms)", header, rows)
+    return figures
 
 
-def sequences() -> None:
-    rows = []
+def poses(count: int) -> list[Figure]:
+    """Largest errors without noise, start 0.3 px and 0.17 deg off, by sampler."""
+    rows, figures = [], []
+    for name, scene in SCENES.items():
+        for turn in (False, True):
+            for interpolation in ("bilinear", "bspline3", "bspline5"):
+                px, deg, bad = _worst(scatter(scene, Draws(0.0, count, turn, interpolation=interpolation, seed=1)))
+                rows.append((name, MOTIONS[turn], interpolation, f"{px:.5f}", f"{deg:.5f}", str(bad)))
+                title = f"{name}, {MOTIONS[turn]}, {interpolation} / largest error"
+                figures += [Figure(title, px, "px", "lower", 0.1), Figure(f"{title}, theta", deg, "deg", "lower", 0.1)]
+    header = ("scene", "motion", "sampler", "largest px", "largest deg", "not converged")
+    show(f"{count} random poses, rounded to 8 bit, no noise", header, rows)
+    return figures
+
+
+def _worst(s: Scatter) -> tuple[float, float, int]:
+    x, y, theta = s.error.abs().amax(0).tolist()
+    return max(x, y), math.degrees(theta), int((s.status != 0).sum())
+
+
+def sequences() -> list[Figure]:
+    rows, figures = [], []
     scene = SCENES["waves"]
     for noise in (0.0, 2.0, 5.0, 10.0):
         camera = Camera(noise_sigma=noise)
         run = track_path(Sequence(scene, Harmonic().path(camera), camera))
         rows.append(("eq. (11), 20 px, 5 deg", f"{noise:g}", *_cells(run)))
+        figures.append(Figure(f"eq. (11), noise {noise:g} / rms", run.rms[0], "px", "lower", 0.1))
     angles = torch.arange(0, 722, 2) * math.pi / 180
     camera = Camera(size=(221, 221))
     path = torch.stack((110 + 0 * angles, 110 + 0 * angles, angles), -1).double()
     rows.append(("0 to 720 deg in steps of 2", "0", *_cells(track_path(Sequence(scene, path, camera)))))
     show("Sequences, 8 bit", ("motion", "noise", "rms px", "rms deg", "largest px", "largest deg", "lost"), rows)
+    return figures
 
 
 def _cells(run) -> tuple[str, ...]:
     return (*(f"{v:.5f}" for v in (*run.rms, *run.largest)), str(run.lost))
 
 
-def lights() -> None:
-    rows = []
+def lights() -> list[Figure]:
+    rows, figures = [], []
     for light in (None, GradientLight(scale_px=640), SpotLight(scale_px=640)):
         for name, scene in SCENES.items():
             for method, run in under_light(scene, light, Harmonic(50.0, 10.0, 60)).items():
-                rows.append((type(light).__name__ if light else "even", name, method, *_cells(run)))
+                kind = type(light).__name__ if light else "even"
+                rows.append((kind, name, method, *_cells(run)))
+                figures.append(Figure(f"{kind}, {name}, {method} / largest", run.largest[0], "px", "lower", 0.1))
     header = ("light", "scene", "method", "rms px", "rms deg", "largest px", "largest deg", "lost")
     show("Uneven light, no noise, eq. (11) with 50 px and 10 deg", header, rows)
 
+    return figures
+
+
+@click.command()
+@click.argument("draws", default=1500)
+@click.option("--poses", "count", default=1000, show_default=True)
+@click.option("--only", multiple=True, type=click.Choice(["scatters", "poses", "sequences", "lights"]))
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
+def main(draws: int, count: int, only: tuple[str, ...], out: Path | None) -> None:
+    """Print what the README quotes."""
+    torch.set_num_threads(1)
+    sections: dict[str, Callable[[], list[Figure]]] = {
+        "scatters": lambda: scatters(draws),
+        "poses": lambda: poses(count),
+        "sequences": sequences,
+        "lights": lights,
+    }
+    figures = [figure for name, make in sections.items() if not only or name in only for figure in make()]
+    if out is not None:
+        save(out, figures, draws=str(draws), poses=str(count))
+
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
-    scatters(int(sys.argv[1]) if len(sys.argv) > 1 else 1500)
-    sequences()
-    lights()
+    main()

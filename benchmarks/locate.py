@@ -55,7 +55,8 @@ def simulated(
     x, y = SIDE * 0.71 + u[:, 0] * (SIZE[1] - SIDE * 1.42), SIDE * 0.71 + u[:, 1] * (SIZE[0] - SIDE * 1.42)
     truth = torch.stack((x, y, (u[:, 2] - 0.5) * math.tau), -1)
     place = torch.cat(((u[:, 3:] - 0.5) * torch.tensor(spread), torch.zeros(len(u), 1)), -1)
-    camera = Camera(size=SIZE, noise_sigma=noise, light=GradientLight())
+    # 0.7: the exposure at which the bright corner of the light does not saturate
+    camera = Camera(size=SIZE, noise_sigma=noise, light=GradientLight(), gain=0.7)
     small, half = Camera(size=(SIDE, SIDE), noise_sigma=noise), torch.tensor([(SIDE - 1) / 2] * 2 + [0.0]).double()
     made = 0
     for k in range(len(u)):
