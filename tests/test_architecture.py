@@ -21,7 +21,7 @@ LAYERS = [
     {"criteria", "synchrony"},
     {"reference"},
     {"solver", "pyramid"},
-    {"judge", "bank"},
+    {"judge", "bank", "native"},
     {"align", "patches"},
     {"locate"},
     {"tracker"},

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_ecc import native
 from torch_ecc.estimate import Estimate
-from torch_ecc.frame import as_gray, require_tensor
+from torch_ecc.frame import as_image, require_tensor
 from torch_ecc.judge import judge
 from torch_ecc.reference import Reference
 from torch_ecc.solver import Settings, State, refine
@@ -21,16 +22,18 @@ def align(
     interpolation: str = "bspline3",
     max_iterations: int = 15,
     tolerance: float = 1e-3,
+    backend: str = "auto",
 ) -> Estimate:
     """Poses of B prepared templates in their images: (B or 1, 1, H, W), start (B, 3) px, px, rad -> Estimate.
 
     One image serves all templates without copies. ``displacement`` counts from the start pose, which failed elements
-    keep. Raises ValueError for bad shapes, dtypes, devices, NaN and unknown options.
+    keep. ``backend``: "auto", "torch" or "native", see solver.Settings. Raises ValueError for bad shapes, dtypes,
+    devices, NaN and unknown options.
     """
     if not isinstance(reference, Reference):
         raise ValueError(f"align: reference must come from prepare, got {type(reference).__name__}")
-    settings = Settings(interpolation, max_iterations, tolerance)
-    gray = as_gray("align", "image", image)
+    settings = Settings(interpolation, max_iterations, tolerance, backend=backend)
+    gray = as_image("align", "image", image)
     pose = require_tensor("align", "pose", pose)
     b, device = len(reference.K), reference.K.device
     if pose.shape != (b, 3):
@@ -46,6 +49,19 @@ def align(
 
 
 def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
-    """``align`` without its checks: grey levels (B or 1, 1, H, W), poses (B, 3) of the reference's pose dtype."""
-    state = refine(reference, image, State.start(reference, pose), settings)
+    """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype."""
+    if not native.serves(reference, image, settings):
+        return solve_in_torch(reference, image, pose, settings)
+    estimate, left = native.solve(reference, image, pose, settings)
+    if not left:
+        return estimate
+    rest = (estimate.status < 0).nonzero()[:, 0]
+    part = image if len(image) == 1 else image[rest]
+    settled = solve_in_torch(reference.select(rest), part, pose[rest], settings)
+    return Estimate(*(e.index_copy(0, rest, s) for e, s in zip(estimate, settled, strict=True)))
+
+
+def solve_in_torch(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
+    """``solve`` on any device, with any criterion: what the native path is measured against."""
+    state = refine(reference, image.float(), State.start(reference, pose), settings)
     return judge(reference, (image.shape[-2], image.shape[-1]), state, pose, settings)

@@ -64,6 +64,7 @@ def demo(out: str, frames: int) -> None:
 @click.option("--min-score", type=float, help="Below this correlation a template is lost [default: 0.5].")
 @click.option("--search/--no-search", default=None, help="Look for a lost template in the whole frame [default: yes].")
 @click.option("--device", help="cpu, cuda, ... [default: cpu].")
+@click.option("--backend", help="On a CPU: auto, torch or native [default: auto].")
 @click.option("--overlay/--no-overlay", default=None, help="Write overlay.mp4 [default: yes].")
 def track(config: str | None, size: str | None, polygons: tuple[str, ...], **options: Any) -> None:
     """Track patches through a video: x, y and theta of each in every frame.

@@ -29,7 +29,13 @@ def as_device(where: str, device: torch.device | str | None) -> torch.device | N
 
 
 def as_gray(where: str, name: str, image: object, device: torch.device | str | None = None) -> Tensor:
-    """One or many images as float32 grey levels (B, 1, H, W) on ``device``; the numbers keep the frame's own scale.
+    """``as_image`` in float32."""
+    return as_image(where, name, image, device).float()
+
+
+def as_image(where: str, name: str, image: object, device: torch.device | str | None = None) -> Tensor:
+    """One or many images as grey levels (B, 1, H, W) on ``device``: uint8 and uint16 stay what they are if they are
+    grey already, all else becomes float32. No copy where none is needed; the numbers keep the frame's own scale.
 
     ``image``: (H, W), (C, H, W) or (B, C, H, W) of uint8, uint16 or float, C = 1 (grey), 3 (RGB) or 4 (RGBA; the
     alpha is dropped). Raises ValueError for any other shape or dtype, for an empty image and for NaN or infinity.
@@ -46,6 +52,8 @@ def as_gray(where: str, name: str, image: object, device: torch.device | str | N
     if image.shape[1] not in (1, 3, 4):
         hint = " (channels last? use permute(2, 0, 1))" if shape[-1] in (1, 3, 4) else ""
         raise ValueError(f"{where}: {name} must have 1, 3 or 4 channels, got {shape}{hint}")
+    if image.shape[1] == 1 and not image.is_floating_point():
+        return image.to(device=device)
     gray = image.to(device=device, dtype=torch.float32)
     # The sum is finite exactly when all pixels are (no frame is large enough to overflow a float32 sum of grey
     # levels), and costs a thirtieth of isfinite().all().

@@ -57,6 +57,7 @@ class TrackJob:
     min_score: float = 0.5
     search: bool = True
     device: str | None = None
+    backend: str = "auto"
     um_per_px: float | Point | None = None
     axis_angle_deg: float = 0.0
     fps: float | None = None
@@ -115,6 +116,7 @@ class Session:
         self.frames = frames if job.reference else chain((first,), frames)
         names = (
             "criterion illumination interpolation max_iterations tolerance levels prediction device min_score search"
+            " backend"
         )
         options = {name: getattr(job, name) for name in names.split()}
         centers, size, mask = self.templates

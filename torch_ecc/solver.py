@@ -24,7 +24,8 @@ class Settings:
     """How to iterate and when to believe the result.
 
     ``tolerance``: remaining error in px at the template's farthest pixel. A template is lost below ``min_score`` and
-    out of view when less than ``min_visible`` of its weight lies in the frame.
+    out of view when less than ``min_visible`` of its weight lies in the frame. ``backend``: "auto" is the native path
+    on a CPU where it is there or can be compiled, "native" says so if it cannot, "torch" never is.
     """
 
     interpolation: str = "bspline3"
@@ -32,11 +33,15 @@ class Settings:
     tolerance: float = 1e-3
     min_score: float = 0.5
     min_visible: float = 0.25
+    backend: str = "auto"
 
     def __post_init__(self) -> None:
-        known = ["bilinear", "bspline3", "bspline5"]
-        if self.interpolation not in known:
-            raise ValueError(f"interpolation: expected one of {known}, got {self.interpolation!r}")
+        for name, known in (
+            ("interpolation", ["bilinear", "bspline3", "bspline5"]),
+            ("backend", ["auto", "torch", "native"]),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: expected one of {known}, got {getattr(self, name)!r}")
         if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
             raise ValueError(f"max_iterations: expected a whole number of at least 1, got {self.max_iterations}")
         if not self.tolerance > 0:

@@ -9,10 +9,11 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from torch_ecc import native
 from torch_ecc.align import solve
 from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.estimate import Estimate, Status, Track
-from torch_ecc.frame import as_device, as_gray
+from torch_ecc.frame import as_device, as_gray, as_image
 from torch_ecc.locate import LEAST_SEEN, Located, Locator, as_good, halvings
 from torch_ecc.patches import Centers, Size, cut, locate_patches
 from torch_ecc.pose import compose, inverse, unwrap
@@ -20,6 +21,7 @@ from torch_ecc.pyramid import SMALLEST_COARSE, pyramid
 from torch_ecc.reference import Reference
 from torch_ecc.solver import Settings, State, stage
 
+STATE = ("pose", "velocity", "start", "score", "tracked", "doubted")  # in the order of native.track
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
@@ -48,7 +50,7 @@ class Tracker(nn.Module):
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
     the frame's); ``min_score``: below it a template is lost; ``search``: look for a template that is lost, or looks
     less like itself than usual, in the whole frame at any angle: in every frame at first, and ever more seldom the
-    longer it stays so (every 16th frame in the end).
+    longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or "native", see solver.Settings.
     Raises ValueError for what does not fit.
     """
 
@@ -76,11 +78,12 @@ class Tracker(nn.Module):
         device: torch.device | str | None = None,
         min_score: float = 0.5,
         search: bool = True,
+        backend: str = "auto",
     ) -> None:
         super().__init__()
         if prediction not in PREDICTIONS:
             raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
-        self.settings = Settings(interpolation, max_iterations, tolerance, min_score)
+        self.settings = Settings(interpolation, max_iterations, tolerance, min_score, backend=backend)
         self.prediction, self.search = prediction, search
         chosen = make_criterion(criterion, illumination)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
@@ -136,10 +139,14 @@ class Tracker(nn.Module):
 
         The frame is moved to the tracker's device. Raises ValueError for another shape, a wrong dtype, NaN.
         """
-        gray = as_gray("track", "frame", frame, self.pose.device)
-        if gray.shape != self.frame_shape:
-            raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(gray.shape)}")
-        images = [gray]
+        image = as_image("track", "frame", frame, self.pose.device)
+        if image.shape != self.frame_shape:
+            raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
+        if self.levels == 1 and native.serves(self.references[0], image, self.settings):
+            done = self._at_once(image)
+            if done is not None:
+                return done
+        images = [image.float()]
         estimate = self._solve(images, compose(self.pose, self.velocity))
         if self.search:
             for index in self._due(self._strange(estimate)):
@@ -164,6 +171,16 @@ class Tracker(nn.Module):
         if not estimates:
             raise ValueError("track_sequence: frames must hold at least one frame, got none")
         return Track.stack(estimates)
+
+    def _at_once(self, image: Tensor) -> Estimate | None:
+        """Prediction, solve and update in one native call; None if that is not all that this frame needs."""
+        state = [self.pose, self.velocity, self.start, self.score, self.tracked, self.doubted]
+        hold = self.prediction == "hold"
+        step = native.track(self.references[0], image, state, self.settings, hold=hold, search=self.search)
+        if step is None:
+            return None
+        self._buffers.update(zip(STATE, step[1], strict=True))
+        return step[0]
 
     def _solve(self, images: list[Tensor], pose: Tensor) -> Estimate:
         """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are."""

@@ -1,0 +1,171 @@
+"""The native path gives what the torch path gives, over random problems; it is compiled once and may be missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torch_ecc import ECC, SSD, Status, Tracker, align, native, prepare
+from torch_ecc.sim.scene import PlaneWaves
+from torch_ecc.solver import Settings
+
+SCENE = PlaneWaves.random(seed=1)
+FRAME = (110, 130)
+CRITERIA = [ECC("gain"), ECC("linear"), ECC("quadratic"), SSD()]
+
+compiled = pytest.mark.skipif(not native.load(False), reason="no C++ compiler here builds the native path")
+
+
+class Problem(NamedTuple):
+    """Templates, images and starts of an alignment, drawn at random."""
+
+    size: tuple[int, int]
+    count: int
+    shared: bool
+    masked: bool
+    anywhere: bool
+    blank: bool
+    tilted: bool
+    dtype: torch.dtype
+    seed: int
+
+    def made(self, criterion):
+        generator = torch.Generator().manual_seed(self.seed)
+
+        def draw(*shape):
+            return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+        (h, w), (height, width), n = self.size, FRAME, self.count
+        shown = 1 if self.shared else n
+        still = torch.tensor([[(w - 1) / 2, (h - 1) / 2, 0.0]], dtype=torch.float64).expand(n, 3)
+        truth = torch.stack((40 + draw(n) * 50, 40 + draw(n) * 30, (draw(n) - 0.5) * 6), -1)
+        if self.anywhere:
+            truth[:, :2] = draw(n, 2) * torch.tensor([width, height])
+        if self.shared:
+            truth = truth[:1].expand(n, 3)
+        mask = (draw(n, h, w) > 0.2) * draw(n, h, w) if self.masked else None
+        if mask is not None:
+            mask[:, :3] = 1
+        reference = prepare(self.stored(SCENE.render(still, (h, w))), criterion=criterion, mask=mask)
+        image = SCENE.render(truth[:shown], FRAME) * (0 if self.blank else 1)
+        if self.tilted:  # so much that the plain correlation is no match
+            image = image + 3 * torch.arange(width, dtype=image.dtype)
+        noise = torch.randn(image.shape, generator=generator) * 2
+        start = truth + (draw(n, 3) - 0.5) * torch.tensor([2.0, 2.0, 0.04])
+        return reference, self.stored(image if self.blank else image + noise), start
+
+    def stored(self, image):
+        if self.dtype.is_floating_point:
+            return image.to(self.dtype)
+        scale, most = (1, 255) if self.dtype == torch.uint8 else (100, 65535)
+        return (image * scale).round().clamp(0, most).to(self.dtype)
+
+
+problems = st.builds(
+    Problem,
+    size=st.tuples(st.integers(11, 48), st.integers(11, 48)),
+    count=st.integers(1, 3),
+    shared=st.booleans(),
+    masked=st.booleans(),
+    anywhere=st.booleans(),
+    blank=st.sampled_from([False, False, False, True]),
+    tilted=st.booleans(),
+    dtype=st.sampled_from([torch.uint8, torch.uint16, torch.float32]),
+    seed=st.integers(0, 999),
+)
+
+
+@compiled
+@settings(deadline=None, max_examples=200)
+@given(problems, st.sampled_from(CRITERIA), st.sampled_from(["bilinear", "bspline3", "bspline5"]), st.integers(1, 15))
+def test_native_and_torch_agree(problem, criterion, interpolation, budget):
+    reference, image, start = problem.made(criterion)
+    fast, slow = (
+        align(reference, image, start, interpolation=interpolation, max_iterations=budget, backend=backend)
+        for backend in ("native", "torch")
+    )
+    assert torch.equal(fast.status, slow.status)
+    assert ((fast.pose - slow.pose).abs() < 1e-4).all()
+    assert torch.equal(fast.displacement, fast.pose - start)
+    assert torch.equal(fast.covariance.isfinite(), slow.covariance.isfinite())
+    good = Status.good(slow.status)
+    assert ((fast.iterations - slow.iterations).abs() <= 1)[good].all()
+    torch.testing.assert_close(fast.score[good], slow.score[good], rtol=0, atol=1e-4)
+    torch.testing.assert_close(fast.residual_rms[good], slow.residual_rms[good], rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(fast.sigma[good], slow.sigma[good], rtol=1e-2, atol=0)
+
+
+@compiled
+def test_a_batch_is_its_elements_and_threads_do_not_matter():
+    reference, image, start = problems_of_many().made(ECC())
+    one = [align(reference.select(torch.tensor([k])), image[k : k + 1], start[k : k + 1]) for k in range(len(start))]
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        many = align(reference, image, start, backend="native")
+    finally:
+        torch.set_num_threads(threads)
+    for field, parts in zip(many, zip(*one, strict=True), strict=True):
+        assert torch.equal(field, torch.cat(parts))
+
+
+def problems_of_many() -> Problem:
+    return Problem((31, 40), 16, False, False, False, False, False, torch.uint8, seed=3)
+
+
+@compiled
+def test_frames_are_read_where_they_are():
+    """Rows with gaps, columns with gaps and a channel of a larger tensor: the same as a copy of them."""
+    reference, image, start = problems_of_many()._replace(count=1).made(ECC())
+    plain = align(reference, image, start)
+    wide = torch.nn.functional.pad(image.int(), (3, 5, 2, 4), value=99).to(torch.uint8)
+    for view in (
+        wide[:, :, 2:-4, 3:-5],
+        image.repeat_interleave(2, -1)[..., ::2],
+        image.expand(1, 4, -1, -1)[:, 1:2],
+    ):
+        assert torch.equal(align(reference, view, start).pose, plain.pose)
+
+
+@compiled
+@pytest.mark.parametrize("options", [{"criterion": "ecc_paper"}, {"levels": 2}, {"interpolation": "bilinear"}, {}])
+def test_a_tracker_follows_the_same_path(options):
+    centers = [(50.0, 50.0), (80.0, 60.0), (115.0, 20.0)]  # the last one leaves the frame
+    steps = torch.linspace(0, 1, 8, dtype=torch.float64)
+    middle = torch.tensor([60.0, 50.0, 0.0], dtype=torch.float64)
+    poses = middle + torch.stack((14 * steps, -9 * steps**2, 0.1 * steps), -1)
+    frames = SCENE.render(poses, FRAME).round().clamp(0, 255).to(torch.uint8)
+    tracks = [
+        Tracker(frames[0], centers, 29, backend=backend, **options).track_sequence(frames)
+        for backend in ("native", "torch")
+    ]
+    assert torch.equal(*(track.status for track in tracks))
+    assert (tracks[0].pose - tracks[1].pose).abs().max() < 2e-4
+
+
+def test_without_a_compiler_torch_serves(tmp_path):
+    """One clear line if the native path was asked for, none otherwise, and the same answer."""
+    code = """
+import sys, torch, torch_ecc as te
+frame = torch.rand(60, 60)
+print(te.Tracker(frame, [(30, 30)], 21, backend=sys.argv[1]).track(frame).pose.round().abs().tolist())
+"""
+    environment = {"PATH": "", "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(Path(native.__file__).parents[1])}
+    for backend, expected in (("native", "no C++ compiler"), ("auto", "")):
+        command = [sys.executable, "-c", code, backend]
+        run = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+        assert run.stdout.strip() == "[[30.0, 30.0, 0.0]]"
+        assert expected in run.stderr
+        assert ("torch path serves" in run.stderr) == (backend == "native")
+
+
+def test_unknown_backend():
+    with pytest.raises(ValueError, match=r"backend: expected one of \['auto', 'torch', 'native'\], got 'gpu'"):
+        Settings(backend="gpu")

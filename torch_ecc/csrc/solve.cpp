@@ -1,0 +1,166 @@
+// torch.ops.torch_ecc: align.solve and one step of the tracker for templates on the CPU, in parallel over them.
+#include <ATen/Parallel.h>
+#include <ATen/core/Tensor.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/empty_like.h>
+#include <torch/library.h>
+
+#include "judge.h"
+
+namespace {
+
+using at::Tensor;
+
+// The tensors of torch_ecc.Reference in their order, without the criterion.
+enum Field { PIXELS, BOX, BLOCK, BLOCK_SIZES, CENTRE, RADIUS, NOISE, SIGNAL, INSTRUMENT, TRUST, WEIGHT, ALIAS, K, SLOPE,
+             SPREAD, INFLATION, SPREAD_NOISE, SHARE, FIELDS };
+
+struct Fields {
+  std::vector<Tensor> all;
+  int light;
+
+  ecc::Template at(int64_t b) const {
+    const int64_t n = all[PIXELS].size(1), p = all[K].size(1);
+    const auto f = [&](Field k, int64_t each) { return all[k].const_data_ptr<float>() + b * each; };
+    const auto d = [&](Field k, int64_t each) { return all[k].const_data_ptr<double>() + b * each; };
+    const float *pixels = all[PIXELS].const_data_ptr<float>(), *box = all[BOX].const_data_ptr<float>();
+    ecc::Template t{n, p, all[BLOCK_SIZES].size(0), light, pixels, pixels + n, f(K, p * n), f(SIGNAL, 4 * n), f(SIGNAL, 4 * n) + 3 * n,
+                    f(WEIGHT, all[WEIGHT].size(0) == 1 ? 0 : n)};
+    for (int k = 0; k < 8; ++k) t.box[k / 4][k % 4] = box[k];
+    for (int k = 0; k < 2; ++k) t.centre[k] = f(CENTRE, 2)[k];
+    t.radius = *d(RADIUS, 1);
+    t.noise = *f(NOISE, 1);
+    t.noise_share = *d(SHARE, 1);
+    t.alias = d(ALIAS, 12);
+    t.slope = d(SLOPE, 9);
+    t.spread = d(SPREAD, 9);
+    t.inflation = d(INFLATION, 9);
+    t.spread_noise = d(SPREAD_NOISE, 9);
+    return t;
+  }
+};
+
+ecc::Frame frame_of(const Tensor& image, int64_t b) {
+  const auto kind = image.scalar_type();
+  const int64_t offset = image.size(0) == 1 ? 0 : b * image.stride(0) * image.element_size();
+  return {static_cast<const char*>(image.const_data_ptr()) + offset, image.size(2), image.size(3), image.stride(2),
+          kind == at::kByte     ? ecc::Frame::U8
+          : kind == at::kUInt16 ? ecc::Frame::U16
+                                : ecc::Frame::F32};
+}
+
+struct Outcome {  // the fields of Estimate, and how many templates have a status: others wait for the torch path
+  Tensor pose, displacement, score, status, iterations, covariance, residual;
+  int64_t unsettled;
+
+  std::vector<Tensor> fields() const { return {pose, displacement, score, status, iterations, covariance, residual}; }
+};
+
+// image (1 or B, 1, H, W) uint8, uint16 or float32 and poses to start from (B, 3) float64. Templates at the frame's
+// border, where pixels drop out, are not settled: status -1.
+Outcome align(const Tensor& image, at::TensorList reference, const Tensor& start, int64_t light,
+              const ecc::Settings& set) {
+  const Tensor rows = image.stride(3) == 1 ? image : image.contiguous(), poses = start.contiguous();
+  Fields fields{{}, int(light)};
+  for (const Tensor& tensor : reference) fields.all.push_back(tensor.contiguous());
+  const int64_t count = poses.size(0);
+  const auto real = poses.options();
+  Outcome out{at::empty({count, 3}, real), at::empty({count, 3}, real), at::empty({count}, real),
+              at::empty({count}, real.dtype(at::kChar)), at::empty({count}, real.dtype(at::kLong)),
+              at::empty({count, 3, 3}, real), at::empty({count}, real), 0};
+  double *pose = out.pose.data_ptr<double>(), *moved = out.displacement.data_ptr<double>(),
+         *score = out.score.data_ptr<double>(), *covariance = out.covariance.data_ptr<double>(),
+         *residual = out.residual.data_ptr<double>();
+  int8_t* status = out.status.data_ptr<int8_t>();
+  int64_t* iterations = out.iterations.data_ptr<int64_t>();
+  at::parallel_for(0, count, 1, [&](int64_t first, int64_t last) {
+    thread_local ecc::Scratch scratch;
+    for (int64_t b = first; b < last; ++b) {
+      const ecc::Template t = fields.at(b);
+      const double* from = poses.const_data_ptr<double>() + 3 * b;
+      ecc::State state{{from[0], from[1], from[2]}};
+      ecc::Verdict verdict{};
+      verdict.status = ecc::Status(-1);
+      if (ecc::refine(t, frame_of(rows, b), set, state, scratch)) verdict = ecc::judge(t, set, state, scratch);
+      const bool good = ecc::good(verdict.status);
+      for (int k = 0; k < 3; ++k) {
+        pose[3 * b + k] = good ? state.pose[k] : from[k];
+        moved[3 * b + k] = pose[3 * b + k] - from[k];
+      }
+      for (int k = 0; k < 9; ++k) covariance[9 * b + k] = good ? verdict.covariance[k] : k % 4 ? 0 : HUGE_VAL;
+      score[b] = verdict.score;
+      status[b] = verdict.status;
+      iterations[b] = state.iterations;
+      residual[b] = std::sqrt(verdict.power);
+    }
+  });
+  out.unsettled = std::count(status, status + count, int8_t(-1));
+  return out;
+}
+
+std::tuple<std::vector<Tensor>, int64_t> solve(const Tensor& image, at::TensorList reference, const Tensor& pose,
+                                               int64_t light, int64_t degree, int64_t max_iterations, double tolerance,
+                                               double min_score) {
+  const Outcome out = align(image, reference, pose, light, {degree, max_iterations, tolerance, min_score});
+  return {out.fields(), out.unsettled};
+}
+
+// One frame of Tracker: state = [pose, velocity, start, score, tracked, doubted] -> the fields of Estimate and the next
+// state; or nothing if the torch path is needed, for templates at the border, or if there are some to be searched for.
+std::vector<Tensor> track(const Tensor& image, at::TensorList reference, at::TensorList state, int64_t light,
+                          int64_t degree, int64_t max_iterations, double tolerance, double min_score, bool hold,
+                          bool search) {
+  const int64_t count = state[0].size(0);
+  std::vector<Tensor> now, next;
+  for (const Tensor& tensor : state) {
+    now.push_back(tensor.contiguous());
+    next.push_back(at::empty_like(now.back()));
+  }
+  const double *pose = now[0].const_data_ptr<double>(), *velocity = now[1].const_data_ptr<double>(),
+               *start = now[2].const_data_ptr<double>(), *usual = now[3].const_data_ptr<double>();
+  double *next_pose = next[0].data_ptr<double>(), *next_velocity = next[1].data_ptr<double>();
+  next[2] = now[2];
+  for (int64_t b = 0; b < count; ++b) ecc::compose(pose + 3 * b, velocity + 3 * b, next_pose + 3 * b);
+  const Outcome out = align(image, reference, next[0], light, {degree, max_iterations, tolerance, min_score});
+  const double* score = out.score.const_data_ptr<double>();
+  const int8_t* status = out.status.const_data_ptr<int8_t>();
+  const auto strange = [&](int64_t b) {  // Tracker._strange
+    return !ecc::good(status[b]) || 1 - score[b] > ecc::WORSE * (1 - usual[b]) + ecc::SLACK;
+  };
+  bool all_familiar = true;
+  for (int64_t b = 0; b < count; ++b) all_familiar = all_familiar && !strange(b);
+  if (out.unsettled || (search && !all_familiar)) return {};
+  for (int64_t b = 0; b < count; ++b) {  // Tracker._advance
+    const bool good = ecc::good(status[b]);
+    double *found = out.pose.data_ptr<double>() + 3 * b, *moved = out.displacement.data_ptr<double>() + 3 * b;
+    if (!good) std::copy(pose + 3 * b, pose + 3 * b + 3, found);
+    for (int k = 0; k < 3; ++k) {
+      next_pose[3 * b + k] = found[k];
+      next_velocity[3 * b + k] = 0;
+      moved[k] = found[k] - start[3 * b + k];
+    }
+    if (good && !hold && now[4].const_data_ptr<bool>()[b]) ecc::between(pose + 3 * b, found, next_velocity + 3 * b);
+    next[3].data_ptr<double>()[b] = good ? usual[b] + ecc::MEMORY * (score[b] - usual[b]) : usual[b];
+    next[4].data_ptr<bool>()[b] = good;
+    next[5].data_ptr<int64_t>()[b] = strange(b) ? now[5].const_data_ptr<int64_t>()[b] + 1 : 0;
+  }
+  std::vector<Tensor> all = out.fields();
+  all.insert(all.end(), next.begin(), next.end());
+  return all;
+}
+
+}  // namespace
+
+TORCH_LIBRARY(torch_ecc, m) {
+  m.def(
+      "solve(Tensor image, Tensor[] reference, Tensor pose, int light, int degree, int max_iterations, "
+      "float tolerance, float min_score) -> (Tensor[], int)");
+  m.def(
+      "track(Tensor image, Tensor[] reference, Tensor[] state, int light, int degree, int max_iterations, "
+      "float tolerance, float min_score, bool hold, bool search) -> Tensor[]");
+}
+
+TORCH_LIBRARY_IMPL(torch_ecc, CPU, m) {
+  m.impl("solve", &solve);
+  m.impl("track", &track);
+}

@@ -1,0 +1,115 @@
+"""The native path on a CPU: the solve of ``align.solve`` as one C++ operator, compiled on first use and cached.
+
+The torch path stays the reference; both give the same poses to 1e-4 px. Sources: ``csrc``. One compilation takes some
+ten seconds, says so on stderr, and serves this version of torch and this kind of CPU from then on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torch_ecc.criteria import ECC, ILLUMINATION, SSD
+from torch_ecc.estimate import Estimate
+from torch_ecc.reference import Reference
+from torch_ecc.solver import Settings
+
+SOURCES = Path(__file__).parent / "csrc"
+DEGREE = {"bilinear": 1, "bspline3": 3, "bspline5": 5}
+DTYPES = (torch.uint8, torch.uint16, torch.float32)
+# Sums may be reordered and vectorised; NaN and infinity keep their meaning.
+MATHS = ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"]
+INSTRUCTIONS = {
+    "AVX2": ["-mavx2", "-mfma"],
+    "AVX512": ["-mavx512f", "-mavx512vl", "-mavx512bw", "-mavx512dq", "-mfma"],
+}
+
+
+def serves(reference: Reference, image: Tensor, settings: Settings) -> bool:
+    """Whether the native path takes this: its criterion, dtype and device, and it is asked for and can be had."""
+    return (
+        settings.backend != "torch"
+        and type(reference.criterion) in (ECC, SSD)
+        and image.device.type == "cpu"
+        and image.dtype in DTYPES
+        and load(settings.backend == "native")
+    )
+
+
+def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> tuple[Estimate, int]:
+    """Estimate of B templates in (B or 1, 1, H, W) of one of DTYPES, from poses (B, 3), and how many are left out.
+
+    Those have status -1: at the frame's border, where pixels drop out of sight, the torch path is needed.
+    """
+    operator = torch.ops.torch_ecc.solve.default
+    fields, left = operator(image, list(reference[1:]), pose, *_options(reference, settings))
+    return Estimate(*fields), left
+
+
+def track(
+    reference: Reference, image: Tensor, state: list[Tensor], settings: Settings, *, hold: bool, search: bool
+) -> tuple[Estimate, list[Tensor]] | None:
+    """One frame of a Tracker of one level: its estimate and the next ``state`` = [pose, velocity, start, score,
+    tracked, doubted]. None if the torch path is needed: for templates at the border, or some to ``search`` for."""
+    operator = torch.ops.torch_ecc.track.default
+    fields = operator(image, list(reference[1:]), state, *_options(reference, settings), hold, search)
+    count = len(Estimate._fields)
+    return (Estimate(*fields[:count]), fields[count:]) if fields else None
+
+
+def _options(reference: Reference, settings: Settings) -> tuple[int | float, ...]:
+    criterion = reference.criterion
+    light = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else -1
+    degree = DEGREE[settings.interpolation]
+    return light, degree, settings.max_iterations, settings.tolerance, settings.min_score
+
+
+@lru_cache(maxsize=2)
+def load(wanted: bool) -> bool:
+    """Whether the operator is there, compiled now if need be. ``wanted``: say so if there is no compiler."""
+    compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    try:
+        if compiler is None:
+            raise OSError("no C++ compiler is found; CXX names one")
+        torch.ops.load_library(str(library(compiler)))
+    except (OSError, RuntimeError, subprocess.SubprocessError) as error:
+        if wanted or compiler is not None:
+            reason = str(getattr(error, "stderr", None) or error).strip().splitlines()[0]
+            warnings.warn(f"torch_ecc: no native path, the slower torch path serves ({reason})", stacklevel=2)
+        return False
+    return True
+
+
+def library(compiler: str) -> Path:
+    """The compiled operator in the user's cache folder, made if it is not there. Raises OSError, SubprocessError."""
+    sources = sorted(SOURCES.iterdir())
+    instructions = INSTRUCTIONS.get(torch.backends.cpu.get_cpu_capability(), [])
+    flags = ["-O3", "-std=c++20", "-shared", "-fPIC", *MATHS, *instructions]
+    flags += ["-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-fopenmp"]
+    flags.append(f"-D_GLIBCXX_USE_CXX11_ABI={int(torch.compiled_with_cxx11_abi())}")
+    parts = [torch.__version__, sys.platform, compiler, *flags, *(source.read_text() for source in sources)]
+    name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torch_ecc"
+    target = folder / f"native-{name}.so"
+    if not target.is_file():
+        print("torch_ecc: compiling the native CPU path, once (some 10 s) ...", file=sys.stderr, flush=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        home = Path(torch.__file__).parent
+        include = [f"-I{home / 'include'}", f"-I{home / 'include' / 'torch' / 'csrc' / 'api' / 'include'}"]
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:  # renamed when finished: no process sees half of it
+            made = Path(scratch) / target.name
+            command = [compiler, *flags, *include, str(SOURCES / "solve.cpp"), "-o", str(made)]
+            command += [f"-L{home / 'lib'}", "-ltorch_cpu", "-lc10"]
+            subprocess.run(command, check=True, capture_output=True, text=True)
+            made.replace(target)
+    return target
