@@ -56,7 +56,7 @@ def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings)
     if not left:
         return estimate
     rest = (estimate.status < 0).nonzero()[:, 0]
-    part = image if len(image) == 1 else image[rest]
+    part = image if len(image) == 1 else image.float()[rest]  # torch 2.4 cannot index uint16
     settled = solve_in_torch(reference.select(rest), part, pose[rest], settings)
     return Estimate(*(e.index_copy(0, rest, s) for e, s in zip(estimate, settled, strict=True)))
 
