@@ -15,6 +15,7 @@ approximation that serves while the motion between frames is small; with eq. 10 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
@@ -33,6 +34,8 @@ CERTAIN = 1.3  # times the noise's power in that window: by chance alone it is n
 ALIASING = ("bilinear", "bspline3")  # samplers whose own error counts; that of bspline5 does not
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
 LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
+ENOUGH = 3000  # pixels of a template tell well where to go; the first iterations leave out others in x and y
+SPARSEST = 4  # px between those that are kept
 BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
 SMALLEST = 5  # px: side of the smallest template
 
@@ -51,6 +54,8 @@ class Reference(NamedTuple):
     with the samplers ``ALIASING``; each (B, 3, 3) ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other
     columns, ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each;
     ``noise_share`` (B,) is the largest part of ``slope`` that such noise can be, in any direction.
+
+    For the first iterations: ``sparse`` (n,), pixels on a coarser grid, and ``K_sparse`` (B, p, n), made from them alone.
     """
 
     criterion: Criterion
@@ -72,6 +77,8 @@ class Reference(NamedTuple):
     inflation: Tensor
     spread_noise: Tensor
     noise_share: Tensor
+    sparse: Tensor
+    K_sparse: Tensor
 
     @property
     def lever(self) -> Tensor:
@@ -85,11 +92,20 @@ class Reference(NamedTuple):
         half = (self.box[:2, 2] - self.box[:2, 0]).clamp(min=1.0) / 2
         return (self.pixels[:2] - self.centre[:, :, None]) / half[:, None]
 
+    @property
+    def thin(self) -> Reference:
+        """The same templates on their ``sparse`` pixels: all that it takes to come near."""
+        if len(self.sparse) == self.K.shape[-1]:
+            return self
+        pixelwise = ("pixels", "block", "signal", "instrument", "trust", "weight")
+        some = {name: getattr(self, name)[..., self.sparse] for name in pixelwise}
+        return self._replace(**some, sparse=torch.arange(len(self.sparse), device=self.K.device), K=self.K_sparse)
+
     def select(self, index: Tensor) -> Reference:
         """The reference of the templates at ``index`` (n,)."""
         if len(index) == len(self.K):
             return self
-        shared = {"criterion", "pixels", "box", "block", "block_sizes"} | (
+        shared = {"criterion", "pixels", "box", "block", "block_sizes", "sparse"} | (
             {"weight"} if len(self.weight) == 1 else set()
         )
         return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))
@@ -184,7 +200,13 @@ def _assemble(criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor,
         weight,
         no_alias,
     )
-    return reweigh(Reference(criterion, *constants, signal, nothing, nothing, nothing, nothing, radius), weight > 0)
+    column, row = (pixels[:2] - box[:2, :1]).long()
+    step = min(max(math.isqrt(pixels.shape[1] // ENOUGH), 1), SPARSEST)
+    sparse = ((column % step == 0) & (row % step == 0)).nonzero()[:, 0]
+    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, signal[:, :, sparse])
+    reference = Reference(criterion, *constants, *rest)
+    thin = reweigh(reference.thin, weight[:, sparse] > 0)
+    return reweigh(reference._replace(K_sparse=thin.K), weight > 0)
 
 
 def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:

@@ -114,12 +114,13 @@ def secant(state: State, delta: Tensor, length: Tensor) -> tuple[Tensor, Tensor]
     """Stretch of an increment ``delta`` (B, 3) of the given ``length`` (B,), and the rate of convergence, (B,) each.
 
     Noise in the template shortens every step by one factor, so that steps shrink in a geometric series. Two of them
-    tell its sum (the secant method on their common line). Only near the answer: far from it steps are no such series.
+    tell its sum (the secant method on their common line). Only near the answer, where steps are such a series, and
+    within one stage: another sampler or other pixels have another answer, to which the first step is no part of it.
     """
     last = torch.linalg.vector_norm(state.delta, dim=-1)
     rate = torch.where(last > 0, length / last, 0.5).clamp(0.05, 0.95)
     along = (state.delta * delta).sum(-1) / (last * last)  # = 1 - (last stretch) * (share that a step covers)
-    usable = (last < SECANT_RANGE) & (along < 0.9)  # NaN at the first step is not
+    usable = (last < SECANT_RANGE) & (along < 0.9) & state.error.isfinite()
     return torch.where(usable, (state.factor / (1 - along)).clamp(1.0, LARGEST_STRETCH), 1.0), rate
 
 
@@ -146,11 +147,13 @@ def check_period(device: torch.device) -> int:
 
 
 def refine(reference: Reference, image: Tensor, state: State, settings: Settings) -> State:
-    """From a start within the basin to the answer: bilinear iterations first, the asked interpolation to finish."""
-    budget = settings.max_iterations
-    if settings.interpolation != "bilinear" and budget > 1:
+    """From a start within the basin to the answer: bilinear and few pixels first, then all that is asked for."""
+    budget, thin, patch = settings.max_iterations, reference.thin, state.patch
+    if budget > 1 and (settings.interpolation != "bilinear" or thin is not reference):
         coarse = max(budget * 2 // 3, 1)
-        state = stage(reference, image, state, "bilinear", max(settings.tolerance, COARSE_TOLERANCE), coarse)
+        state = state._replace(patch=patch[:, : thin.K.shape[-1]])
+        state = stage(thin, image, state, "bilinear", max(settings.tolerance, COARSE_TOLERANCE), coarse)
+        state = state._replace(patch=patch)
         budget -= coarse
     return stage(reference, image, state, settings.interpolation, settings.tolerance, budget)
 

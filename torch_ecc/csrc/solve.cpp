@@ -13,7 +13,7 @@ using at::Tensor;
 
 // The tensors of torch_ecc.Reference in their order, without the criterion.
 enum Field { PIXELS, BOX, BLOCK, BLOCK_SIZES, CENTRE, RADIUS, NOISE, SIGNAL, INSTRUMENT, TRUST, WEIGHT, ALIAS, K, SLOPE,
-             SPREAD, INFLATION, SPREAD_NOISE, SHARE, FIELDS };
+             SPREAD, INFLATION, SPREAD_NOISE, SHARE, SPARSE, K_SPARSE };
 
 struct Fields {
   std::vector<Tensor> all;
@@ -75,13 +75,17 @@ Outcome align(const Tensor& image, at::TensorList reference, const Tensor& start
   int64_t* iterations = out.iterations.data_ptr<int64_t>();
   at::parallel_for(0, count, 1, [&](int64_t first, int64_t last) {
     thread_local ecc::Scratch scratch;
+    thread_local ecc::Thin thin;
     for (int64_t b = first; b < last; ++b) {
       const ecc::Template t = fields.at(b);
+      const int64_t few = fields.all[SPARSE].size(0);
+      thin.gather(t, fields.all[SPARSE].const_data_ptr<int64_t>(), few,
+                  fields.all[K_SPARSE].const_data_ptr<float>() + b * t.p * few);
       const double* from = poses.const_data_ptr<double>() + 3 * b;
       ecc::State state{{from[0], from[1], from[2]}};
       ecc::Verdict verdict{};
       verdict.status = ecc::Status(-1);
-      if (ecc::refine(t, frame_of(rows, b), set, state, scratch)) verdict = ecc::judge(t, set, state, scratch);
+      if (ecc::refine(t, thin.t, frame_of(rows, b), set, state, scratch)) verdict = ecc::judge(t, set, state, scratch);
       const bool good = ecc::good(verdict.status);
       for (int k = 0; k < 3; ++k) {
         pose[3 * b + k] = good ? state.pose[k] : from[k];

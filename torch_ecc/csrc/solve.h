@@ -131,7 +131,7 @@ inline void advance(const Template& t, const double (&step)[3], State& state) {
   last = std::sqrt(last);
   const double rate = std::clamp(last > 0 ? length / last : 0.5, 0.05, 0.95);
   along /= last * last;
-  const bool usable = last < SECANT_RANGE && along < 0.9;  // NaN at the first step is not
+  const bool usable = last < SECANT_RANGE && along < 0.9 && std::isfinite(state.error);
   const double factor = usable ? std::clamp(state.factor / (1 - along), 1.0, LARGEST_STRETCH) : 1.0;
   const double stretch = std::min(factor, LONGEST_STEP * t.radius / std::max(length, 1e-12));
   state.pose[2] -= step[2] * stretch;
@@ -159,14 +159,34 @@ void iterate(const Template& t, const Frame& frame, double tolerance, int64_t bu
   }
 }
 
+// What the first iterations use of a template: its sparse pixels, gathered.
+struct Thin {
+  std::vector<float> px, py, level;
+  Template t;
+
+  // sparse (n), K (p, n) of torch_ecc.Reference
+  void gather(const Template& whole, const int64_t* sparse, int64_t n, const float* K) {
+    t = whole;
+    for (auto [to, from] : {std::pair{&px, whole.px}, {&py, whole.py}, {&level, whole.level}}) {
+      to->resize(n);
+      for (int64_t i = 0; i < n; ++i) (*to)[i] = from[sparse[i]];
+    }
+    t.n = n;
+    t.K = K;
+    t.px = px.data();
+    t.py = py.data();
+    t.level = level.data();
+  }
+};
+
 // solver.refine. False, with nothing settled, if the template comes so near the frame's border that pixels may drop out.
-inline bool refine(const Template& t, const Frame& frame, const Settings& set, State& state, Scratch& scratch) {
+inline bool refine(const Template& t, const Template& thin, const Frame& frame, const Settings& set, State& state, Scratch& scratch) {
   int64_t budget = set.max_iterations;
   scratch.patch.resize(t.n);
   if (!inside(t, state.pose, frame, EDGE)) return false;
-  if (set.degree > 1 && budget > 1) {
+  if (budget > 1 && (set.degree > 1 || thin.n < t.n)) {
     const int64_t coarse = std::max<int64_t>(budget * 2 / 3, 1);
-    iterate<1>(t, frame, std::max(set.tolerance, COARSE_TOLERANCE), coarse, state, scratch);
+    iterate<1>(thin, frame, std::max(set.tolerance, COARSE_TOLERANCE), coarse, state, scratch);
     budget -= coarse;
     if (!inside(t, state.pose, frame, EDGE)) return false;
   }
