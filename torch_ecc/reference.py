@@ -55,7 +55,7 @@ class Reference(NamedTuple):
     columns, ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each;
     ``noise_share`` (B,) is the largest part of ``slope`` that such noise can be, in any direction.
 
-    For the first iterations: ``sparse`` (n,), pixels on a coarser grid, and ``K_sparse`` (B, p, n), made from them alone.
+    For the first iterations: ``sparse`` (n,), pixels on a coarser grid; ``K_sparse`` (B, p, n), made from them alone.
     """
 
     criterion: Criterion
