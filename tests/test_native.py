@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torch_ecc import ECC, SSD, Status, Tracker, align, native, prepare
+from torch_ecc import ECC, SSD, Status, Tracker, align, native, prepare, reference
 from torch_ecc.sim.scene import PlaneWaves
 from torch_ecc.solver import Settings
 
@@ -33,6 +33,7 @@ class Problem(NamedTuple):
     anywhere: bool
     blank: bool
     tilted: bool
+    enough: int
     dtype: torch.dtype
     seed: int
 
@@ -53,13 +54,15 @@ class Problem(NamedTuple):
         mask = (draw(n, h, w) > 0.2) * draw(n, h, w) if self.masked else None
         if mask is not None:
             mask[:, :3] = 1
-        reference = prepare(self.stored(SCENE.render(still, (h, w))), criterion=criterion, mask=mask)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(reference, "ENOUGH", self.enough)
+            prepared = prepare(self.stored(SCENE.render(still, (h, w))), criterion=criterion, mask=mask)
         image = SCENE.render(truth[:shown], FRAME) * (0 if self.blank else 1)
         if self.tilted:  # so much that the plain correlation is no match
             image = image + 3 * torch.arange(width, dtype=image.dtype)
         noise = torch.randn(image.shape, generator=generator) * 2
         start = truth + (draw(n, 3) - 0.5) * torch.tensor([2.0, 2.0, 0.04])
-        return reference, self.stored(image if self.blank else image + noise), start
+        return prepared, self.stored(image if self.blank else image + noise), start
 
     def stored(self, image):
         if self.dtype.is_floating_point:
@@ -77,6 +80,7 @@ problems = st.builds(
     anywhere=st.booleans(),
     blank=st.sampled_from([False, False, False, True]),
     tilted=st.booleans(),
+    enough=st.sampled_from([100, 3000]),
     dtype=st.sampled_from([torch.uint8, torch.uint16, torch.float32]),
     seed=st.integers(0, 999),
 )
@@ -86,9 +90,9 @@ problems = st.builds(
 @settings(deadline=None, max_examples=200)
 @given(problems, st.sampled_from(CRITERIA), st.sampled_from(["bilinear", "bspline3", "bspline5"]), st.integers(1, 15))
 def test_native_and_torch_agree(problem, criterion, interpolation, budget):
-    reference, image, start = problem.made(criterion)
+    prepared, image, start = problem.made(criterion)
     fast, slow = (
-        align(reference, image, start, interpolation=interpolation, max_iterations=budget, backend=backend)
+        align(prepared, image, start, interpolation=interpolation, max_iterations=budget, backend=backend)
         for backend in ("native", "torch")
     )
     assert torch.equal(fast.status, slow.status)
@@ -104,12 +108,12 @@ def test_native_and_torch_agree(problem, criterion, interpolation, budget):
 
 @compiled
 def test_a_batch_is_its_elements_and_threads_do_not_matter():
-    reference, image, start = problems_of_many().made(ECC())
-    one = [align(reference.select(torch.tensor([k])), image[k : k + 1], start[k : k + 1]) for k in range(len(start))]
+    prepared, image, start = problems_of_many().made(ECC())
+    one = [align(prepared.select(torch.tensor([k])), image[k : k + 1], start[k : k + 1]) for k in range(len(start))]
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        many = align(reference, image, start, backend="native")
+        many = align(prepared, image, start, backend="native")
     finally:
         torch.set_num_threads(threads)
     for field, parts in zip(many, zip(*one, strict=True), strict=True):
@@ -117,21 +121,21 @@ def test_a_batch_is_its_elements_and_threads_do_not_matter():
 
 
 def problems_of_many() -> Problem:
-    return Problem((31, 40), 16, False, False, False, False, False, torch.uint8, seed=3)
+    return Problem((31, 40), 16, False, False, False, False, False, 100, torch.uint8, seed=3)
 
 
 @compiled
 def test_frames_are_read_where_they_are():
     """Rows with gaps, columns with gaps and a channel of a larger tensor: the same as a copy of them."""
-    reference, image, start = problems_of_many()._replace(count=1).made(ECC())
-    plain = align(reference, image, start)
+    prepared, image, start = problems_of_many()._replace(count=1).made(ECC())
+    plain = align(prepared, image, start)
     wide = torch.nn.functional.pad(image.int(), (3, 5, 2, 4), value=99).to(torch.uint8)
     for view in (
         wide[:, :, 2:-4, 3:-5],
         image.repeat_interleave(2, -1)[..., ::2],
         image.expand(1, 4, -1, -1)[:, 1:2],
     ):
-        assert torch.equal(align(reference, view, start).pose, plain.pose)
+        assert torch.equal(align(prepared, view, start).pose, plain.pose)
 
 
 @compiled

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -108,7 +109,7 @@ def library(compiler: str) -> Path:
         include = [f"-I{home / 'include'}", f"-I{home / 'include' / 'torch' / 'csrc' / 'api' / 'include'}"]
         with tempfile.TemporaryDirectory(dir=folder) as scratch:  # renamed when finished: no process sees half of it
             made = Path(scratch) / target.name
-            command = [compiler, *flags, *include, str(SOURCES / "solve.cpp"), "-o", str(made)]
+            command = [*shlex.split(compiler), *flags, *include, str(SOURCES / "solve.cpp"), "-o", str(made)]
             command += [f"-L{home / 'lib'}", "-ltorch_cpu", "-lc10"]
             subprocess.run(command, check=True, capture_output=True, text=True)
             made.replace(target)
