@@ -58,7 +58,7 @@ class Problem(NamedTuple):
             patch.setattr(reference, "ENOUGH", self.enough)
             prepared = prepare(self.stored(SCENE.render(still, (h, w))), criterion=criterion, mask=mask)
         image = SCENE.render(truth[:shown], FRAME) * (0 if self.blank else 1)
-        if self.tilted:  # so much that the plain correlation is no match
+        if self.tilted and not self.blank:  # so much that the plain correlation is no match
             image = image + 3 * torch.arange(width, dtype=image.dtype)
         noise = torch.randn(image.shape, generator=generator) * 2
         start = truth + (draw(n, 3) - 0.5) * torch.tensor([2.0, 2.0, 0.04])
