@@ -1,0 +1,96 @@
+"""Many templates in one frame, beside a loop over OpenCV's ECC: python benchmarks/batch.py [--count N] [--threads N]
+
+Templates of 121 px spread over 640 x 480 under eq. (11) with 10 px and 2 deg, everyone starting from the previous pose.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import cv2
+import torch
+from results import Figure, save
+from rich.console import Console
+from rich.table import Table
+from rivals import rivals
+from scaling import SCENE, spread
+from torch import Tensor
+from trackers import options
+
+from torch_ecc import Tracker
+from torch_ecc.experiments.accuracy import SIZE, Harmonic
+from torch_ecc.sim import Camera, Sequence
+
+YARDSTICK = "OpenCV ECC, fastest fair"
+MOTION = Harmonic(10.0, 2.0, 20)
+console = Console(width=110)
+Follow = Callable[[Tensor], Tensor]
+
+
+def loop(first: Tensor, centers: Tensor) -> Follow:
+    """OpenCV's ECC, one template after the other; NaN where it gave up."""
+    follow = [rivals()[YARDSTICK].start(first, (x, y), SIZE) for x, y in centers.tolist()]
+    nothing = (math.nan,) * 3
+    return lambda frame: torch.tensor([one(frame) or nothing for one in follow], dtype=torch.float64)
+
+
+def batch(first: Tensor, centers: Tensor, **chosen: str) -> Follow:
+    """One Tracker of all templates."""
+    tracker = Tracker(first, centers, SIZE, prediction="hold", **chosen)
+    return lambda frame: tracker(frame).pose
+
+
+@click.command()
+@click.option("--count", default=64, show_default=True)
+@click.option("--threads", default=2, show_default=True)
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
+def main(count: int, threads: int, out: Path | None) -> None:
+    """Templates per second and errors, side by side."""
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+    sequence = Sequence(SCENE, MOTION.path(Camera()), Camera())
+    frames, centers = list(sequence), spread(count, SIZE + 40, (480, 640)).round()
+    follow = {YARDSTICK: loop(frames[0], centers)}
+    for backend, chosen in options().items():
+        for sampler in ("bilinear", "bspline3"):
+            title = ", ".join(filter(None, (f"torch_ecc {sampler}", backend)))
+            follow[title] = batch(frames[0], centers, interpolation=sampler, **chosen)
+    taken: dict[str, list[float]] = {name: [] for name in follow}
+    errors: dict[str, list[Tensor]] = {name: [] for name in follow}
+    for frame, truth in zip(frames[1:], sequence.truth(centers)[1:], strict=True):
+        for name, one in follow.items():
+            begun = time.perf_counter()
+            pose = one(frame)
+            taken[name].append(time.perf_counter() - begun)
+            errors[name].append(pose - truth)
+    _show(f"{count} templates, {threads} threads", taken, errors, count, out)
+
+
+def _show(title: str, taken: dict[str, list[float]], errors: dict[str, list[Tensor]], count: int, out: Path | None):
+    table = Table(title=title, title_justify="left")
+    for column in ("tracker", "templates per s", "over OpenCV's", "rms px", "rms deg", "lost"):
+        table.add_column(column, justify="left" if column == "tracker" else "right")
+    rate = {name: count / statistics.median(values[1:]) for name, values in taken.items()}
+    figures = []
+    for name, parts in errors.items():
+        error = torch.cat(parts)
+        good = error[:, :2].abs().amax(1) < 0.5
+        x, y, theta = error[good].square().mean(0).sqrt().tolist()
+        ratio, lost = rate[name] / rate[YARDSTICK], f"{int((~good).sum())} of {len(good)}"
+        cells = (f"{rate[name]:,.0f}", f"{ratio:.1f}", f"{max(x, y):.5f}", f"{math.degrees(theta):.5f}", lost)
+        table.add_row(name, *cells)
+        mine = None if name == YARDSTICK else 0.5
+        figures.append(Figure(f"{title} / {name} / over OpenCV's", ratio, "x", "higher", mine))
+        figures.append(Figure(f"{title} / {name} / rms", max(x, y), "px", "lower", mine and 0.15))
+    console.print(table)
+    if out is not None:
+        save(out, figures)
+
+
+if __name__ == "__main__":
+    main()
