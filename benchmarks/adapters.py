@@ -7,17 +7,16 @@ gives up. Frames are uint8 tensors (1, H, W).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_ecc import Status, Tracker
-from torch_ecc.pose import from_opencv, to_opencv
 
 Pose = tuple[float, float, float]
 Follow = Callable[[Tensor], Pose | None]
@@ -59,23 +58,23 @@ def aligned(make: Callable[[], Align], *, reach: int | None, surround: int = 0, 
     """
 
     def start(first: Tensor, center: tuple[float, float], size: int) -> Follow:
-        pose = torch.tensor([*center, 0.0], dtype=torch.float64)
         side, align = size + 2 * surround, make()
         smooth = _smooth if blur else np.ascontiguousarray
-        template = np.ascontiguousarray(_square(smooth(first[0].numpy()), pose, side)[0])
+        middle, (x, y) = np.array([(side - 1) / 2] * 2 + [1.0]), center
+        template = np.ascontiguousarray(_square(smooth(first[0].numpy()), x, y, side)[0])
+        warp = np.array([[1.0, 0.0, x - middle[0]], [0.0, 1.0, y - middle[1]]])  # template pixel -> frame pixel
 
         def follow(frame: Tensor) -> Pose | None:
-            nonlocal pose
+            nonlocal warp
             image, corner = frame[0].numpy(), np.zeros((2, 3))
             if reach is not None:
-                image, corner = _square(image, pose, size + 2 * reach)
-            warp = to_opencv(pose, (side, side)).numpy() - corner
+                image, corner = _square(image, *(warp @ middle).tolist(), size + 2 * reach)
             try:
-                warp = align(template, smooth(image), warp) + corner
+                warp = align(template, smooth(image), warp - corner) + corner
             except (cv2.error, RuntimeError):
                 return None
-            pose = from_opencv(torch.from_numpy(warp), (side, side))
-            return tuple(pose.tolist())
+            x, y = (warp @ middle).tolist()
+            return x, y, math.atan2(warp[0, 1] - warp[1, 0], warp[0, 0] + warp[1, 1])
 
         return follow
 
@@ -86,9 +85,9 @@ def _smooth(image: Image) -> Image:
     return cv2.GaussianBlur(image.astype(np.float32), (5, 5), 0)
 
 
-def _square(image: Image, pose: Tensor, side: int) -> tuple[Image, Image]:
-    """The square around ``pose``, moved into the image where it would leave it, and a 2x3 matrix of its corner."""
-    x, y = (round(v - (side - 1) / 2) for v in pose[:2].tolist())
+def _square(image: Image, x: float, y: float, side: int) -> tuple[Image, Image]:
+    """The square around (x, y), moved into the image where it would leave it, and a 2x3 matrix of its corner."""
     h, w = image.shape
-    x, y = max(min(x, w - side), 0), max(min(y, h - side), 0)
-    return image[y : y + side, x : x + side], np.array([[0, 0, x], [0, 0, y]], dtype=np.float64)
+    left = max(min(round(x - (side - 1) / 2), w - side), 0)
+    top = max(min(round(y - (side - 1) / 2), h - side), 0)
+    return image[top : top + side, left : left + side], np.array([[0, 0, left], [0, 0, top]], dtype=np.float64)

@@ -9,14 +9,12 @@ from rivals import rivals
 from torch_ecc import Tracker
 from torch_ecc.sim import PlaneWaves
 
-VARIANTS = {
-    "bilinear": {"interpolation": "bilinear"},
-    "bspline3": {"interpolation": "bspline3"},
-    "bspline5": {"interpolation": "bspline5"},
-    "bspline3, gain": {"illumination": "gain"},
-    "bspline3, quadratic": {"illumination": "quadratic"},
-    "bspline3, ecc_paper": {"criterion": "ecc_paper"},
-    "bspline3, ssd": {"criterion": "ssd"},
+SAMPLERS = ("bilinear", "bspline3", "bspline5")
+CRITERIA = {
+    "gain": {"illumination": "gain"},
+    "quadratic": {"illumination": "quadratic"},
+    "ecc_paper": {"criterion": "ecc_paper"},
+    "ssd": {"criterion": "ssd"},
 }
 
 
@@ -39,10 +37,15 @@ def options() -> dict[str, dict[str, str]]:
 
 
 def trackers() -> dict[str, Peer]:
-    """All of them. torch_ecc starts from the previous pose like its peers; "default" is as shipped, with prediction."""
+    """All of them. torch_ecc starts from the previous pose like its peers; "default" is as shipped, with prediction.
+
+    Samplers on each backend, criteria on the one that the library chooses itself.
+    """
     mine = {}
     for backend, chosen in options().items():
-        for name, variant in VARIANTS.items():
+        for name in SAMPLERS:
             title = ", ".join(filter(None, (f"torch_ecc {name}", backend)))
-            mine[title] = Peer(ours(prediction="hold", **variant, **chosen), "torch_ecc")
+            mine[title] = Peer(ours(prediction="hold", interpolation=name, **chosen), "torch_ecc")
+    for name, criterion in CRITERIA.items():
+        mine[f"torch_ecc {name}"] = Peer(ours(prediction="hold", **criterion), "torch_ecc")
     return mine | {"torch_ecc default": Peer(ours(), "torch_ecc")} | rivals()
