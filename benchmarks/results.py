@@ -34,10 +34,10 @@ class Result(NamedTuple):
 
 
 def save(path: Path, figures: Iterable[Figure], **about: str) -> None:
-    """Write a result. Four digits are kept; a number that is not finite becomes null."""
+    """Write a result. Four digits are kept; a number that is not finite becomes null; what is the default is left out."""
     load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
     facts = environment() | _peers() | {"load": load} | about
-    rows = [figure._replace(value=_kept(figure.value))._asdict() for figure in figures]
+    rows = [_row(figure) for figure in figures]
     lines = ",\n".join(f"    {json.dumps(row, allow_nan=False)}" for row in rows)
     path.write_text(f'{{\n  "about": {json.dumps(facts)},\n  "figures": [\n{lines}\n  ]\n}}\n', encoding="utf-8")
 
@@ -54,8 +54,10 @@ def load(path: Path) -> Result:
     return Result(about, {f.name: f if f.value is not None else f._replace(value=nan) for f in figures})
 
 
-def _kept(value: float) -> Any:
-    return float(f"{value:.4g}") if math.isfinite(value) else None
+def _row(figure: Figure) -> dict[str, Any]:
+    value = float(f"{figure.value:.4g}") if math.isfinite(figure.value) else None
+    default = Figure._field_defaults
+    return {k: v for k, v in figure._replace(value=value)._asdict().items() if k not in default or v != default[k]}
 
 
 def _peers() -> dict[str, str]:
