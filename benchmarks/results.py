@@ -34,7 +34,7 @@ class Result(NamedTuple):
 
 
 def save(path: Path, figures: Iterable[Figure], **about: str) -> None:
-    """Write a result. Four digits are kept; a number that is not finite becomes null; what is the default is left out."""
+    """Write a result: four digits, null for a number that is not finite, and nothing that is the default."""
     load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
     facts = environment() | _peers() | {"load": load} | about
     rows = [_row(figure) for figure in figures]
