@@ -24,6 +24,7 @@ EXACT, TIMED = 0.15, 0.5  # tolerances of our errors and of our times: a shared 
 SMALLEST_PX = 1e-5  # errors below are drawn here: whole-pixel shifts are found exactly
 COLOURS = {
     "torch_ecc": "#0b6e4f",
+    "torch_ecc, torch": "#7cc7a5",
     "OpenCV": "#c8553d",
     "pystackreg": "#7b4ea3",
     "SimpleITK": "#1f77b4",
@@ -126,6 +127,7 @@ def _panel(axes: Axes, work: Work, results: Mapping[str, Result], looks: Mapping
 
 
 def _looks(peers: Mapping[str, Peer]) -> dict[str, tuple[str, str]]:
-    """Colour by whose it is (greens are ours), marker within."""
+    """Colour by whose it is (greens are ours, the light one the torch backend), marker within."""
+    families = {name: "torch_ecc, torch" if name.endswith(", torch") else peer.family for name, peer in peers.items()}
     counts = {family: count() for family in COLOURS}
-    return {name: (COLOURS[peer.family], MARKERS[next(counts[peer.family])]) for name, peer in peers.items()}
+    return {name: (COLOURS[family], MARKERS[next(counts[family])]) for name, family in families.items()}
