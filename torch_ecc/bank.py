@@ -77,9 +77,14 @@ class Bank(NamedTuple):
                 power = self._correlate(square, self.weight[part])
                 power -= self._correlate(spectrum, self.planes[part]).square().sum(1)
                 norm = power.clamp(min=floor.clamp(min=1e-12)).rsqrt()
-            score, turn = (self._correlate(spectrum, self.texture[part]) * norm).max(0)
+            match = self._correlate(spectrum, self.texture[part])
+            if len(self.weight) == 1:  # one norm for all turns: the best of them is best with and without it
+                score = match.amax(0) * norm[0]
+            else:
+                match *= norm
+                score = match.amax(0)
             places.append(_peaks(score, most))
-            turns.append(self.turns[part][turn.flatten()[places[-1].pixel]])
+            turns.append(self.turns[part][match.flatten(1)[:, places[-1].pixel].argmax(0)])
         peaks = Peaks(*(torch.cat(values) for values in zip(*places, strict=True)))
         pose = torch.cat((peaks.place, torch.cat(turns)[:, None]), -1).to(self.offset.dtype)
         back = torch.cat((-self.offset, self.offset.new_zeros(1)))
@@ -87,8 +92,9 @@ class Bank(NamedTuple):
 
     def _correlate(self, spectrum: Tensor, kernels: Tensor) -> Tensor:
         h, w = self.size
-        whole: Tensor = torch.fft.irfft2(spectrum * kernels, s=self.shape)
-        return whole[..., :h, :w]
+        rows = torch.fft.ifft(spectrum * kernels, dim=-2)[..., :h, :]  # the others are not transformed any further
+        whole: Tensor = torch.fft.irfft(rows, n=self.shape[1], dim=-1)
+        return whole[..., :w]
 
 
 class Peaks(NamedTuple):
