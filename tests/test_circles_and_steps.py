@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_ecc.comparison import Motion
-from torch_ecc.experiments import circles, fig6, fig7, fig8, fig9, fig10, fig11, steps
+from torch_ecc.experiments import circles, fig6, fig7, fig8, fig9, fig10, fig11, parasitic, steps
 from torch_ecc.experiments.acquisition import Bench, acquire, ease, zeroed
 from torch_ecc.sim.micrograph import micrograph
 from torch_ecc.sim.microscope import Microscope
@@ -50,13 +50,41 @@ def test_the_joint_estimate_keeps_what_the_nearest_points_absorb(outcomes):
 
 
 def test_parasitic_translation_is_the_lever_arm_times_the_angle(outcomes):
+    """By the sensors' angle as by the true one: the tracker's part of sigma stands alone in the second."""
     found = steps.staircase(True, lambda done, total: None)
-    left, sigma = fig9.deviations(found)
-    assert (left.abs() < 4 * sigma).all()
-    assert left.square().mean().sqrt() < 0.02  # um, of up to 5
-    lever, spread = fig9.lever_arm(found)
+    left, alone = parasitic.deviations(found), parasitic.true_deviations(found)
+    for some in (left, alone):
+        assert (some.nm.abs() < 4 * some.sigma).all()
+        assert 0.3 < some.chi_square < 2
+    assert left.nm.square().mean().sqrt() < 20  # nm, of up to 5 um
+    assert alone.nm.square().mean().sqrt() < 3
+    lever, spread = parasitic.lever_arm(found, left.covariance)
     assert ((lever - torch.tensor(steps.VIEW_UM).double()).abs() < 3 * spread).all()
     assert (spread < 15).all()
+
+
+def test_sigma_of_the_steps_and_of_the_lever_arm_over_many_sets_of_sensors(outcomes):
+    """One set bends all steps alike: only over many of them are deviations and lever arms what sigma says."""
+    found = steps.staircase(True, lambda done, total: None)
+    sets, levers = parasitic.other_sensors(found, 400), []
+    nm = torch.stack([some.nm for some in sets])
+    assert nm[:, :, 1].std(0).allclose(parasitic.sensed(found.dwells["CDS"].mean[1:]).diagonal()[1::2].sqrt(), rtol=0.1)
+    assert torch.tensor([some.chi_square for some in sets]).mean() == pytest.approx(1, abs=0.5)
+    bent = nm - nm.mean(0)  # what the sensors alone make
+    for some in bent:
+        dwells = found.dwells | {"ECC": found.dwells["ECC"]._replace(mean=_by_the_law(found, 1e-3 * some))}
+        levers.append(parasitic.lever_arm(found._replace(dwells=dwells), sets[0].covariance)[0])
+    fits = torch.stack(levers)
+    sensors = parasitic.lever_arm(found, parasitic.sensed(found.dwells["CDS"].mean[1:]))[1]
+    assert (fits - torch.tensor(steps.VIEW_UM).double()).square().mean(0).sqrt().allclose(sensors, rtol=0.1)
+
+
+def _by_the_law(found, more):
+    """Means (K, 3) of a track that follows the sensors exactly but for ``more`` (K - 1, 2) um."""
+    mean = found.dwells["CDS"].mean.clone()
+    mean[:, :2] = parasitic.predicted(mean)
+    mean[1:, :2] += more
+    return mean
 
 
 def test_commands():

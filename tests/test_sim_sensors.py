@@ -18,6 +18,7 @@ from torch_ecc.sim import (
     StageSettings,
     calibrate_mounting,
     error_budget,
+    nonlinear_modes,
 )
 
 IDEAL = {"noise_um": 0.0, "nonlinearity": 0.0, "resolution_um": 0.0}
@@ -152,6 +153,19 @@ def test_budget_is_what_happens():
     torch.testing.assert_close(parts.square().sum(0).sqrt(), budget.total)
     assert float(budget.mounting.abs().max()) == 0
     torch.testing.assert_close(budget.noise[0, 2] * 30000 / 2**0.5, torch.tensor(2e-3).double(), rtol=1e-4, atol=0)
+
+
+def test_one_set_of_sensors_bends_all_its_poses_alike():
+    """Covariance of the errors at different poses, over many sets of sensors."""
+    poses = torch.tensor(((4.0, -9.0, 0.001), (9.0, -11.0, 0.004), (-3.0, 0.0, -0.002)), dtype=torch.float64)
+    settings = SensorSettings(**{**IDEAL, "nonlinearity": 1e-3})
+    told = settings.mounting.pose(Sensors(settings, batch=20000, seed=1).read(torch.cat((0 * poses[:1], poses)))[0])
+    error = (told[:, 1:] - told[:, :1] - poses).flatten(1)
+    modes = nonlinear_modes(settings, poses).flatten(0, 1)
+    scale = modes.square().sum(1).sqrt()
+    likeness = modes @ modes.mT / torch.outer(scale, scale)
+    assert likeness.triu(1).abs().max() > 0.9
+    torch.testing.assert_close((error / scale).mT @ (error / scale) / len(error), likeness, rtol=0, atol=0.05)
 
 
 def test_budget_of_the_mounting_is_what_happens():

@@ -94,6 +94,11 @@ def acquire(command: Tensor, bench: Bench, tick: Callable[[], None]) -> Acquisit
     return Acquisition(motions, sigma, read, Motion(times, truth), motion, offset, seconds, first)
 
 
+def tracker_of(first: Tensor, **options: Any) -> Tracker:
+    """The tracker of the template in the middle of the first frame (H, W)."""
+    return Tracker(first, [_middle((first.shape[-2], first.shape[-1]))], SIZE, **options)
+
+
 def zeroed(motion: Motion, rest_s: float) -> Motion:
     """The record from the mean of its first ``rest_s`` s, in which the stage rests."""
     rest = motion.pose[motion.time_s < motion.time_s[0] + rest_s]
@@ -126,9 +131,8 @@ def _track(
     film: Sequence, bench: Bench, seconds: dict[str, float], tick: Callable[[], None]
 ) -> tuple[dict[str, Track], Tensor]:
     """Every method on the same frames, and the first frame (H, W)."""
-    center = [_middle(film.camera.size)]
     first = film.batch(0, 1)[0, 0]
-    trackers = {name: Tracker(first, center, SIZE, **options) for name, options in bench.methods.items()}
+    trackers = {name: tracker_of(first, **options) for name, options in bench.methods.items()}
     found: dict[str, list[Estimate]] = {name: [] for name in trackers}
     for k in range(len(film)):
         with _timed(seconds, "frames"):

@@ -34,7 +34,8 @@ class Staircase(NamedTuple):
     """Records zeroed at rest, and their dwells: ``tracks`` and ``dwells`` by method, "CDS" among the dwells.
 
     ``alignment`` is that of ECC with the sensors, with the lever arm from the sensors' point to the template;
-    ``levels_deg`` (K,) what was commanded; ``windows_s`` (K, 2) where each dwell counts on the sensors' clock.
+    ``levels_deg`` (K,) what was commanded; ``windows_s`` (K, 2) where each dwell counts on the sensors' clock;
+    ``calibration`` from the image to the stage.
     """
 
     acquired: Acquisition
@@ -44,6 +45,7 @@ class Staircase(NamedTuple):
     alignment: Alignment
     levels_deg: Tensor
     windows_s: Tensor
+    calibration: Calibration
 
     def absolute_errors(self, method: str) -> Tensor:
         """The paper's absolute errors (K, 3) um, um, rad: the mean of each step minus that of the CDS."""
@@ -79,7 +81,8 @@ def _run(dwell_s: float, region: tuple[int, int], advance: Advance) -> Staircase
         advance(min(done, total), total)
 
     acquired = acquire(path, bench, tick)
-    turn, rest = Calibration(1.0, microscope.axis_angle), dwell_s / 4  # the angle is known from the circles
+    angle, rest = microscope.axis_angle, dwell_s / 4  # the angle is known from the circles
+    turn, calibration = Calibration(1.0, angle), Calibration(microscope.um_per_px, angle)
     sensors = zeroed(acquired.sensors, rest)
     tracks = {name: zeroed(Motion(m.time_s, turn.to_physical(m.pose)), rest) for name, m in acquired.tracks.items()}
     unknowns = Unknowns(angle=False, lever=True, max_offset_s=0.5)
@@ -89,4 +92,4 @@ def _run(dwell_s: float, region: tuple[int, int], advance: Advance) -> Staircase
     dwells = {name: dwell_errors(m, windows - alignment.offset_s) for name, m in tracks.items()}
     dwells["CDS"] = dwell_errors(sensors, windows)
     levels = STEP_DEG * torch.tensor(LEVELS, dtype=torch.float64)
-    return Staircase(acquired, tracks, sensors, dwells, alignment, levels, windows)
+    return Staircase(acquired, tracks, sensors, dwells, alignment, levels, windows, calibration)

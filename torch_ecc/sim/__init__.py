@@ -14,7 +14,7 @@ from torch_ecc.sim.occluder import Occluder
 from torch_ecc.sim.retinex import Retinex, multi_scale, single_scale
 from torch_ecc.sim.scene import Pads, PlaneWaves, Scene, Speckle, Sum
 from torch_ecc.sim.sensor import Drift, noise_sigma
-from torch_ecc.sim.sensors import ErrorBudget, SensorRecord, Sensors, SensorSettings, error_budget
+from torch_ecc.sim.sensors import ErrorBudget, SensorRecord, Sensors, SensorSettings, error_budget, nonlinear_modes
 from torch_ecc.sim.sequence import Sequence, check_inside
 from torch_ecc.sim.stage import Stage, StageMotion, StageSettings
 from torch_ecc.sim.vibration import Floor, Vibration
@@ -63,6 +63,7 @@ __all__ = [
     "micrograph",
     "multi_scale",
     "noise_sigma",
+    "nonlinear_modes",
     "placed",
     "ramp",
     "random_walk",

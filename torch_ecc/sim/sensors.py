@@ -139,9 +139,7 @@ def error_budget(settings: SensorSettings, poses: Tensor, *, mounting_covariance
         raise ValueError(f"error_budget: mounting_covariance must be (8, 8), got {tuple(mounting_covariance.shape)}")
     poses = poses.double()
     numbers = settings.mounting.numbers().to(poses.device)
-    exact, zero = geometry.distance(numbers, poses), geometry.distance(numbers, torch.zeros_like(poses[:1]))
-    to_pose = torch.func.vmap(torch.func.jacfwd(lambda d: geometry.pose(numbers, d)))(exact)
-    second, third = (a - b for a, b in zip(bends(settings, exact), bends(settings, zero), strict=True))
+    exact, zero, to_pose = _linear(numbers, poses)
 
     def spread(variance: Tensor) -> Tensor:
         """Of the pose from independent variances (N, 3) of the distances."""
@@ -152,13 +150,30 @@ def error_budget(settings: SensorSettings, poses: Tensor, *, mounting_covariance
     parts = [
         spread(settings.resolution_um**2 / 12 * even),
         spread(settings.noise_um**2 * even),
-        spread((second**2 + third**2) / 2),
+        nonlinear_modes(settings, poses).square().sum(-1).sqrt(),
         torch.zeros_like(exact),
     ]
     if mounting_covariance is not None:
         parts[3] = _mounting_sigma(numbers, exact, zero, mounting_covariance.to(exact))
     total = torch.stack(parts).square().sum(0).sqrt()
     return ErrorBudget(parts[0], parts[1], parts[2], parts[3], total)
+
+
+def nonlinear_modes(settings: SensorSettings, poses: Tensor) -> Tensor:
+    """What the non-linearity makes of the displacements to ``poses`` (N, 3) um, um, rad: (N, 3, 6).
+
+    Six independent causes, two shapes of each sensor, each with the rms over sensors of a kind. A set of sensors bends
+    all its poses alike: modes[i] @ modes[j].mT is the covariance (3, 3) of its errors at poses i and j.
+    """
+    exact, zero, to_pose = _linear(settings.mounting.numbers().to(poses.device), poses.double())
+    moved = zip(bends(settings, exact), bends(settings, zero), strict=True)
+    return torch.cat([to_pose * ((a - b) / 2**0.5)[:, None] for a, b in moved], -1)
+
+
+def _linear(numbers: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Distances (N, 3) at poses (N, 3) and (1, 3) at the zero pose, and derivatives (N, 3, 3) of pose by distance."""
+    exact, zero = geometry.distance(numbers, poses), geometry.distance(numbers, torch.zeros_like(poses[:1]))
+    return exact, zero, torch.func.vmap(torch.func.jacfwd(lambda d: geometry.pose(numbers, d)))(exact)
 
 
 def _mounting_sigma(numbers: Tensor, exact: Tensor, zero: Tensor, covariance: Tensor) -> Tensor:
