@@ -63,6 +63,18 @@ def test_parasitic_translation_is_the_lever_arm_times_the_angle(outcomes):
     assert (spread < 15).all()
 
 
+def test_more_frames_do_not_average_out_where_the_template_lies_between_the_pixels(outcomes):
+    """The first step is common to all; aliasing stays when the scatter of the frames has gone."""
+    found = steps.staircase(True, lambda done, total: None)
+    blocks = parasitic.tracked(found).reshape(12, 2, 12, 2)
+    assert torch.allclose(blocks[0, :, 5], parasitic.scattered(found)[0].diag())
+    ecc = found.dwells["ECC"]
+    endless = found._replace(dwells={"ECC": ecc._replace(standard_error=torch.zeros_like(ecc.standard_error))})
+    left = parasitic.tracked(endless)
+    assert torch.equal(left, torch.block_diag(*parasitic.aliased(found)[1:]))
+    assert (left.diagonal().sqrt() > 0.3).all()  # nm
+
+
 def test_sigma_of_the_steps_and_of_the_lever_arm_over_many_sets_of_sensors(outcomes):
     """One set bends all steps alike: only over many of them are deviations and lever arms what sigma says."""
     found = steps.staircase(True, lambda done, total: None)
