@@ -97,6 +97,33 @@ class Bank(NamedTuple):
         return whole[..., :w]
 
 
+def details(reference: Reference, image: Tensor, turns: Tensor, most: int) -> Tensor:
+    """Where ``image`` (h, w) shows what sets one template (B = 1) apart: ``most`` poses (K, 3) at ``turns`` (A,) rad.
+
+    The matched filter in clutter with the spectrum of the frame itself (prewhitening: Turin, 1960), which is taken no
+    finer than a window of the template's size resolves it (Blackman and Tukey): texture that the frame repeats tells
+    no place and is divided away, so that what is rare decides.
+    """
+    template, weight, corner = as_images(reference)
+    reach = math.ceil(math.hypot(*template.shape[-2:]) / 2)
+    (h, w), size = image.shape, [_fast(max(n, 2 * reach + 1)) for n in image.shape]
+    spectrum = torch.fft.rfft2(image - image.mean(), s=size)
+    lags = [torch.fft.fftfreq(n, 1 / n, device=image.device) for n in size]
+    window = torch.exp(-2 * (lags[0][:, None].square() + lags[1].square()) / max(template.shape[-2:]) ** 2)
+    clutter = torch.fft.rfft2(torch.fft.irfft2(spectrum.abs().square(), s=size) * window).real
+    spectrum = spectrum / clutter.clamp(min=FLATTEST * float(clutter.mean()))
+    found = []
+    for turn in turns.to(template.dtype).split(1):
+        kernel = torch.fft.rfft2(_turned(template, weight, -corner, turn, reach)[0][0], s=size)
+        match = torch.fft.irfft2(spectrum * kernel.conj(), s=size).roll((reach, reach), (0, 1))[:h, :w]
+        found.append(_peaks(match / match.std().clamp(min=1e-30), most))
+    score, best = torch.cat([peaks.score for peaks in found]).topk(most)
+    place = torch.cat([peaks.place for peaks in found]).to(turns)[best]
+    pose = torch.cat((place, turns.repeat_interleave(most)[best, None]), -1)
+    back = torch.cat((-reference.centre[0], reference.centre.new_zeros(1))).to(pose)
+    return compose(pose, back.expand_as(pose))
+
+
 class Peaks(NamedTuple):
     """Maxima of an image: number of the ``pixel`` (K,), ``place`` (K, 2) between pixels, height ``score`` (K,)."""
 

@@ -6,13 +6,15 @@ local best, level by level, and drops those that lead to the same pose or fall b
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.align import solve
-from torch_ecc.bank import Bank, search_level
+from torch_ecc.bank import Bank, details, search_level
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.frame import as_gray
 from torch_ecc.judge import flat_correlation
@@ -33,6 +35,8 @@ HOPELESS = 0.3  # correlation of what needs no closer look
 FEWEST = 6  # candidates that are looked at, however low
 SURVIVORS = 16  # of them, brought to the next level
 FINALISTS = 3  # of them, brought to the answer
+TURNS = 4  # and their half turns, at which details are looked for
+DETAILED = 4  # places with the right details, brought to the answer
 COARSE_ITERATIONS = 6
 COARSE_TOLERANCE = 0.1  # px of a coarse level
 NEIGHBOURS = 1.5  # px of the search's level at the farthest pixel: maxima nearer than that lead to one pose
@@ -128,27 +132,34 @@ class Locator:
             raise ValueError(f"locate: near must be ({count}, 2) or ({count}, 3), got {tuple(near.shape)}")
         images = halvings(gray, self.levels)
         places = [None] * count if near is None else list(near.to(self.pyramids[0][0].radius))
-        return _decide([self.candidates(images, b, places[b]) for b in range(count)])
+        return _decide([self.candidates(images, b, places[b], closer=True) for b in range(count)])
 
-    def candidates(self, images: list[Tensor], b: int, near: Tensor | None = None) -> tuple[Estimate, Tensor]:
+    def candidates(
+        self, images: list[Tensor], b: int, near: Tensor | None = None, *, closer: bool = False
+    ) -> tuple[Estimate, Tensor]:
         """Template ``b`` in frames given as ``halvings`` (1 or B, 1, h, w): a few distinct poses (K, ...) and their
-        scores (K,), the best first; of equally good ones those nearest to ``near`` (2,) or (3,) first."""
+        scores (K,), the best first; of equally good ones those nearest to ``near`` (2,) or (3,) first.
+
+        ``closer``: when they are ambiguous, places with the right details are looked at as well.
+        """
         images = [image if len(image) == 1 else image[b : b + 1] for image in images]
         reference = self.pyramids[b][0]
         pose = self.coarse(images, b)
-        chosen = pose[:FINALISTS]
-        if near is not None and len(pose) > FINALISTS:
-            rest = pose[FINALISTS:]
+        chosen, rest = pose[:FINALISTS], pose[FINALISTS:]
+        if near is not None and len(rest):
             chosen = torch.cat((chosen, rest[distance(rest, near, reference.radius).argmin()][None]))
-        copies = _copies(reference, len(chosen))
-        estimate = solve(copies, images[0], chosen, self.settings)
-        score = likeness(copies, images[0], estimate.pose)
-        order = distinct(estimate.pose, score, reference.radius)
-        if near is not None:
-            away = distance(estimate.pose[order], near, reference.radius)
-            away = torch.where(as_good(score[order], score[order[0]]), away, torch.inf)
-            order = order[away.argsort(stable=True)]
-        return Estimate(*(value[order] for value in estimate)), score[order]
+        found = self.refined(images[0], b, chosen)
+        if closer and bool(_decide([ranked(found, reference.radius)]).ambiguous):
+            turns = both_ways(pose[:, 2], reference.radius)
+            more = self.refined(images[0], b, details(reference, images[0][0, 0], turns, DETAILED))
+            found = Estimate(*map(torch.cat, zip(found[0], more[0], strict=True))), torch.cat((found[1], more[1]))
+        return ranked(found, reference.radius, near)
+
+    def refined(self, image: Tensor, b: int, pose: Tensor) -> tuple[Estimate, Tensor]:
+        """Template ``b`` aligned with ``image`` (1, 1, H, W) from poses (K, 3): estimate and score."""
+        copies = _copies(self.pyramids[b][0], len(pose))
+        estimate = solve(copies, image, pose, self.settings)
+        return estimate, likeness(copies, image, estimate.pose)
 
     def coarse(self, images: list[Tensor], b: int) -> Tensor:
         """Poses (K, 3) of template ``b`` in one frame before they are refined at its full resolution, best first."""
@@ -200,6 +211,27 @@ def distinct(pose: Tensor, score: Tensor, radius: Tensor, apart: float = DISTINC
     order = score.argsort(descending=True, stable=True)
     same = distance(pose[order][:, None], pose[order][None], radius) < apart
     return order[~same.tril(-1).any(-1)]
+
+
+def both_ways(turn: Tensor, radius: Tensor) -> Tensor:
+    """The first TURNS of ``turn`` (K,) rad that are DISTINCT px apart at ``radius``, and the same turned by half."""
+    axis = F.pad(2 * turn[:, None], (2, 0))  # a turn and its half turn are one
+    first = distinct(axis, -torch.arange(len(turn), device=turn.device), radius / 2)[:TURNS]
+    return torch.cat((turn[first], turn[first] + math.pi))
+
+
+def ranked(
+    found: tuple[Estimate, Tensor], radius: Tensor, near: Tensor | None = None
+) -> tuple[Estimate, Tensor]:
+    """Distinct ones of found poses (K, ...) with their scores (K,), the best first; of equally good ones those nearest
+    to ``near`` (2,) or (3,) first."""
+    estimate, score = found
+    order = distinct(estimate.pose, score, radius)
+    if near is not None:
+        away = distance(estimate.pose[order], near, radius)
+        away = torch.where(as_good(score[order], score[order[0]]), away, torch.inf)
+        order = order[away.argsort(stable=True)]
+    return Estimate(*(value[order] for value in estimate)), score[order]
 
 
 def foremost(pose: Tensor, score: Tensor, radius: Tensor, apart: float, behind: float) -> Tensor:
