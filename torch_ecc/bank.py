@@ -108,16 +108,17 @@ def details(reference: Reference, image: Tensor, turns: Tensor, most: int) -> Te
     reach = math.ceil(math.hypot(*template.shape[-2:]) / 2)
     (h, w), size = image.shape, [_fast(max(n, 2 * reach + 1)) for n in image.shape]
     spectrum = torch.fft.rfft2(image - image.mean(), s=size)
-    lags = [torch.fft.fftfreq(n, 1 / n, device=image.device) for n in size]
-    window = torch.exp(-2 * (lags[0][:, None].square() + lags[1].square()) / max(template.shape[-2:]) ** 2)
+    lags = (torch.fft.fftfreq(n, 1 / n, device=image.device).abs() for n in size)
+    rows, columns = (F.relu(1 - lag / max(template.shape[-2:])) for lag in lags)
+    window = rows[:, None] * columns  # Bartlett's: its spectrum is nowhere negative
     clutter = torch.fft.rfft2(torch.fft.irfft2(spectrum.abs().square(), s=size) * window).real
-    spectrum = spectrum / clutter.clamp(min=FLATTEST * float(clutter.mean()))
+    spectrum = spectrum / clutter.clamp(min=max(FLATTEST * float(clutter.mean()), 1e-12))
     found = []
     for turn in turns.to(template.dtype).split(1):
         kernel = torch.fft.rfft2(_turned(template, weight, -corner, turn, reach)[0][0], s=size)
         match = torch.fft.irfft2(spectrum * kernel.conj(), s=size).roll((reach, reach), (0, 1))[:h, :w]
         found.append(_peaks(match / match.std().clamp(min=1e-30), most))
-    score, best = torch.cat([peaks.score for peaks in found]).topk(most)
+    best = torch.cat([peaks.score for peaks in found]).topk(most).indices
     place = torch.cat([peaks.place for peaks in found]).to(turns)[best]
     pose = torch.cat((place, turns.repeat_interleave(most)[best, None]), -1)
     back = torch.cat((-reference.centre[0], reference.centre.new_zeros(1))).to(pose)

@@ -37,6 +37,8 @@ SURVIVORS = 16  # of them, brought to the next level
 FINALISTS = 3  # of them, brought to the answer
 TURNS = 4  # and their half turns, at which details are looked for
 DETAILED = 4  # places with the right details, brought to the answer
+LONGEST_WAY = 1.0  # px at the farthest pixel: a refinement that took a pose farther begins anew from there
+REPEATS = 3  # of it at most
 COARSE_ITERATIONS = 6
 COARSE_TOLERANCE = 0.1  # px of a coarse level
 NEIGHBOURS = 1.5  # px of the search's level at the farthest pixel: maxima nearer than that lead to one pose
@@ -159,6 +161,12 @@ class Locator:
         """Template ``b`` aligned with ``image`` (1, 1, H, W) from poses (K, 3): estimate and score."""
         copies = _copies(self.pyramids[b][0], len(pose))
         estimate = solve(copies, image, pose, self.settings)
+        for _ in range(REPEATS):  # where the texture lets a pose slide, iterations are spent on the way
+            way = distance(estimate.displacement, torch.zeros_like(pose), copies.radius)
+            far = (way > LONGEST_WAY).nonzero()[:, 0]
+            if len(far):
+                again = solve(_copies(copies, len(far)), image, estimate.pose[far], self.settings)
+                estimate = Estimate(*(e.index_copy(0, far, a) for e, a in zip(estimate, again, strict=True)))
         return estimate, likeness(copies, image, estimate.pose)
 
     def coarse(self, images: list[Tensor], b: int) -> Tensor:
@@ -220,9 +228,7 @@ def both_ways(turn: Tensor, radius: Tensor) -> Tensor:
     return torch.cat((turn[first], turn[first] + math.pi))
 
 
-def ranked(
-    found: tuple[Estimate, Tensor], radius: Tensor, near: Tensor | None = None
-) -> tuple[Estimate, Tensor]:
+def ranked(found: tuple[Estimate, Tensor], radius: Tensor, near: Tensor | None = None) -> tuple[Estimate, Tensor]:
     """Distinct ones of found poses (K, ...) with their scores (K,), the best first; of equally good ones those nearest
     to ``near`` (2,) or (3,) first."""
     estimate, score = found
