@@ -101,8 +101,8 @@ def details(reference: Reference, image: Tensor, turns: Tensor, most: int) -> Te
     """Where ``image`` (h, w) shows what sets one template (B = 1) apart: ``most`` poses (K, 3) at ``turns`` (A,) rad.
 
     The matched filter in clutter with the spectrum of the frame itself (prewhitening: Turin, 1960), which is taken no
-    finer than a window of the template's size resolves it (Blackman and Tukey): texture that the frame repeats tells
-    no place and is divided away, so that what is rare decides.
+    finer than a window of the template's size resolves it (Blackman and Tukey, 1958): texture that the frame repeats
+    tells no place and is divided away, so that what is rare decides.
     """
     template, weight, corner = as_images(reference)
     reach = math.ceil(math.hypot(*template.shape[-2:]) / 2)
@@ -121,8 +121,8 @@ def details(reference: Reference, image: Tensor, turns: Tensor, most: int) -> Te
     best = torch.cat([peaks.score for peaks in found]).topk(most).indices
     place = torch.cat([peaks.place for peaks in found]).to(turns)[best]
     pose = torch.cat((place, turns.repeat_interleave(most)[best, None]), -1)
-    back = torch.cat((-reference.centre[0], reference.centre.new_zeros(1))).to(pose)
-    return compose(pose, back.expand_as(pose))
+    centre = F.pad(reference.centre, (0, 1)).to(pose)  # places are those of the array's middle
+    return compose(pose, centre.expand_as(pose))
 
 
 class Peaks(NamedTuple):

@@ -1,7 +1,8 @@
 """Find templates anywhere in a frame, at any angle, without a start: global search, coarse to fine (section V).
 
 The correlation with every place and turn at a coarse level (``bank``) gives candidates; Gauss-Newton brings each to its
-local best, level by level, and drops those that lead to the same pose or fall behind.
+local best, level by level, and drops those that lead to the same pose or fall behind. When several places look alike,
+the template's ``details`` are searched for at full resolution as well.
 """
 
 from __future__ import annotations
