@@ -9,7 +9,7 @@ import torch
 
 from torch_ecc import Locator, Status, align, prepare
 from torch_ecc.bank import details
-from torch_ecc.locate import LONGEST_WAY, halvings
+from torch_ecc.locate import LONGEST_WAY, both_ways, halvings
 from torch_ecc.reference import blur
 
 SIZE, HALF = (240, 320), 30
@@ -66,6 +66,14 @@ def test_the_details_tell_what_the_coarse_search_cannot():
         assert found.status == Status.CONVERGED
         assert off(found.pose, truth) < 0.3
     assert sum(e > 5 for e in alone) >= 2  # among such lines the coarse search is lost
+
+
+def test_turns_are_looked_at_both_ways():
+    """Each once, in (-pi, pi], whichever of a turn and its half turn comes first."""
+    turns = both_ways(torch.tensor([3.0, -0.1416, 0.5, 3.001, 0.501, -2.0]), torch.tensor(40.0))
+    assert turns.abs().max() <= math.pi
+    assert torch.allclose(turns[:3], torch.tensor([3.0, 0.5, -2.0]))
+    assert torch.allclose((turns[3:] - turns[:3]).abs(), torch.tensor(math.pi))
 
 
 def test_details_are_found_at_full_resolution():

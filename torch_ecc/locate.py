@@ -165,9 +165,10 @@ class Locator:
         for _ in range(REPEATS):  # where the texture lets a pose slide, iterations are spent on the way
             way = distance(estimate.displacement, torch.zeros_like(pose), copies.radius)
             far = (way > LONGEST_WAY).nonzero()[:, 0]
-            if len(far):
-                again = solve(_copies(copies, len(far)), image, estimate.pose[far], self.settings)
-                estimate = Estimate(*(e.index_copy(0, far, a) for e, a in zip(estimate, again, strict=True)))
+            if len(far) == 0:
+                break
+            again = solve(_copies(copies, len(far)), image, estimate.pose[far], self.settings)
+            estimate = Estimate(*(e.index_copy(0, far, a) for e, a in zip(estimate, again, strict=True)))
         return estimate, likeness(copies, image, estimate.pose)
 
     def coarse(self, images: list[Tensor], b: int) -> Tensor:
@@ -225,8 +226,8 @@ def distinct(pose: Tensor, score: Tensor, radius: Tensor, apart: float = DISTINC
 def both_ways(turn: Tensor, radius: Tensor) -> Tensor:
     """The first TURNS of ``turn`` (K,) rad that are DISTINCT px apart at ``radius``, and the same turned by half."""
     axis = F.pad(2 * turn[:, None], (2, 0))  # a turn and its half turn are one
-    first = distinct(axis, -torch.arange(len(turn), device=turn.device), radius / 2)[:TURNS]
-    return torch.cat((turn[first], turn[first] + math.pi))
+    first = turn[distinct(axis, -torch.arange(len(turn), device=turn.device), radius / 2)[:TURNS]]
+    return unwrap(torch.cat((first, first + math.pi)), torch.zeros_like(first[:1]))
 
 
 def ranked(found: tuple[Estimate, Tensor], radius: Tensor, near: Tensor | None = None) -> tuple[Estimate, Tensor]:
