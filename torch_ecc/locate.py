@@ -143,7 +143,7 @@ class Locator:
         """Template ``b`` in frames given as ``halvings`` (1 or B, 1, h, w): a few distinct poses (K, ...) and their
         scores (K,), the best first; of equally good ones those nearest to ``near`` (2,) or (3,) first.
 
-        ``closer``: when they are ambiguous, places with the right details are looked at as well.
+        ``closer``: when they are ambiguous, or none was near the best, places with the right details come in as well.
         """
         images = [image if len(image) == 1 else image[b : b + 1] for image in images]
         reference = self.pyramids[b][0]
@@ -152,7 +152,9 @@ class Locator:
         if near is not None and len(rest):
             chosen = torch.cat((chosen, rest[distance(rest, near, reference.radius).argmin()][None]))
         found = self.refined(images[0], b, chosen)
-        if closer and bool(_decide([ranked(found, reference.radius)]).ambiguous):
+        best = _decide([ranked(found, reference.radius)])
+        slid = distance(best.pose, chosen, reference.radius).min() > LONGEST_WAY  # perhaps past the place
+        if closer and bool(best.ambiguous | slid):
             turns = both_ways(pose[:, 2], reference.radius)
             more = self.refined(images[0], b, details(reference, images[0][0, 0], turns, DETAILED))
             found = Estimate(*map(torch.cat, zip(found[0], more[0], strict=True))), torch.cat((found[1], more[1]))
