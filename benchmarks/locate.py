@@ -2,13 +2,14 @@
 
 A hit is within 1 px and 1 deg where the last refinement began (``pose`` less ``displacement``). Templates (121 x 121
 px) and frames (640 x 480 px, uneven light) are drawn apart with noise of 5 grey levels (2 on the stills), poses
-anywhere at any angle. "rms px": of the hits and of tracking them from the truth, where tracking has an answer; "worse":
-than tracking by more than 0.001 px and a quarter of the standard deviation that tracking states, or no answer where
-tracking has one. "ms": of unambiguous answers, and of ambiguous ones. OpenCV turns the same template by the same turns
-at the same level and takes the best TM_CCOEFF_NORMED: near is within two pixels and one turn of that bank, its time
-compares with "bank ms". "cv2 fine" is the same at full resolution in steps of 2 deg, in every tenth frame, hits as for
-locate. All run alternately in one process on as many threads; times are median and quartiles. ``--seed``: other poses
-and patches; ``--only``: some of the sets.
+anywhere at any angle. "trackable" are those of them that ``align`` has an answer for when it starts at the truth: in
+the others light and noise have left too little of the texture. "rms px": of the hits and of tracking them from the
+truth, where tracking has an answer; "worse": than tracking by more than 0.001 px and a quarter of the standard
+deviation that tracking states, or no answer where tracking has one. "ms": of unambiguous answers, and of ambiguous
+ones. OpenCV turns the same template by the same turns at the same level and takes the best TM_CCOEFF_NORMED: near is
+within two pixels and one turn of that bank, its time compares with "bank ms". "cv2 fine" is the same at full
+resolution in steps of 2 deg, in every tenth frame, hits as for locate. All run alternately in one process on as many
+threads; times are median and quartiles. ``--seed``: other poses and patches; ``--only``: some of the sets.
 """
 
 from __future__ import annotations
@@ -132,7 +133,8 @@ class Tally:
 
     def row(self) -> tuple[str, ...]:
         n, c, t = self.counts["trials"], self.counts, self.times
-        parts = (f"{c['hits']} of {n}", f"{c['told']} of {n - c['hits']}", str(c["alarms"]), str(c["worse"]))
+        hits = (f"{c['hits']} of {n}", f"{c['trackable hits']} of {c['trackable']}")
+        parts = (*hits, f"{c['told']} of {n - c['hits']}", str(c["alarms"]), str(c["worse"]))
         ours, tracked = torch.tensor(self.errors or [(math.nan, math.nan)]).square().mean(0).sqrt().tolist()
         times = (quartiles(t.get(name, [])) for name in ("clear", "ambiguous", "bank"))
         near, fine = f"{c['near']} of {n}", f"{c['fine']} of {len(t['fine'])}"
@@ -176,7 +178,10 @@ def one(tally: Tally, trial: Trial, locator: Locator, reference: Reference) -> N
     tally.counts["alarms"] += good and doubt
     tally.counts["told"] += not good and (doubt or not answered)
     tracked = align(reference, trial.frame, trial.truth)
-    if good and bool(Status.good(tracked.status)):
+    trackable = bool(Status.good(tracked.status))
+    tally.counts["trackable"] += trackable
+    tally.counts["trackable hits"] += trackable and good
+    if trackable and good:
         ours, theirs = (error(pose, trial.truth)[0] for pose in (found.pose, tracked.pose))
         alike = max(1e-3, ALIKE * float(tracked.sigma[0, :2].norm()))
         tally.errors.append((ours, theirs))
@@ -217,7 +222,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     cv2.setNumThreads(options.threads)
-    ours = ("hits", "misses told", "false alarms", "worse", "rms px", "ms", "ambiguous", "bank ms")
+    ours = ("hits", "trackable", "misses told", "false alarms", "worse", "rms px", "ms", "ambiguous", "bank ms")
     theirs = ("cv2 near", "cv2 ms", "cv2 fine hits", "cv2 fine ms")
     table = Table("set", *ours, *theirs, title=f"Global search, {options.threads} threads, times with quartiles")
     for name, some in trials(Path(options.data), options.poses, options.seed).items():
