@@ -12,13 +12,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torch_ecc import ECC, SSD, Status, Tracker, align, native, prepare, reference
+from torch_ecc import ECC, SSD, PaperECC, Status, Tracker, align, native, prepare, reference
 from torch_ecc.sim.scene import PlaneWaves
 from torch_ecc.solver import Settings
 
 SCENE = PlaneWaves.random(seed=1)
 FRAME = (110, 130)
-CRITERIA = [ECC("gain"), ECC("linear"), ECC("quadratic"), SSD()]
+CRITERIA = [ECC("gain"), ECC("linear"), ECC("quadratic"), SSD(), PaperECC()]
 
 compiled = pytest.mark.skipif(not native.load(False), reason="no C++ compiler here builds the native path")
 

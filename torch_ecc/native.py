@@ -19,15 +19,18 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
-from torch_ecc.criteria import ECC, ILLUMINATION, SSD
+from torch_ecc.criteria import ECC, ILLUMINATION, SSD, Criterion, PaperECC
 from torch_ecc.estimate import Estimate
 from torch_ecc.reference import Reference
 from torch_ecc.solver import Settings
 
 SOURCES = Path(__file__).parent / "csrc"
 DEGREE = {"bilinear": 1, "bspline3": 3, "bspline5": 5}
+CODE: dict[type[Criterion], int] = {SSD: -1, PaperECC: -2}  # beside ECC's number of light columns
 DTYPES = (torch.uint8, torch.uint16, torch.float32)
+_packed = WeakTensorKeyDictionary()
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.
 MATHS = ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"]
 INSTRUCTIONS = {
@@ -40,7 +43,7 @@ def serves(reference: Reference, image: Tensor, settings: Settings) -> bool:
     """Whether the native path takes this: its criterion, dtype and device, and it is asked for and can be had."""
     return (
         settings.backend != "torch"
-        and type(reference.criterion) in (ECC, SSD)
+        and type(reference.criterion) in (ECC, SSD, PaperECC)
         and image.device.type == "cpu"
         and image.dtype in DTYPES
         and load(settings.backend == "native")
@@ -53,7 +56,7 @@ def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings)
     Those have status -1: at the frame's border, where pixels drop out of sight, the torch path is needed.
     """
     operator = torch.ops.torch_ecc.solve.default
-    fields, left = operator(image, list(reference[1:]), pose, *_options(reference, settings))
+    fields, left = operator(image, packed(reference), pose, *_options(settings))
     return Estimate(*fields), left
 
 
@@ -63,16 +66,23 @@ def track(
     """One frame of a Tracker of one level: its estimate and the next ``state`` = [pose, velocity, start, score,
     tracked, doubted]. None if the torch path is needed: for templates at the border, or some to ``search`` for."""
     operator = torch.ops.torch_ecc.track.default
-    fields = operator(image, list(reference[1:]), state, *_options(reference, settings), hold, search)
+    fields = operator(image, packed(reference), state, *_options(settings), hold, search)
     count = len(Estimate._fields)
     return (Estimate(*fields[:count]), fields[count:]) if fields else None
 
 
-def _options(reference: Reference, settings: Settings) -> tuple[int | float, ...]:
-    criterion = reference.criterion
-    light = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else -1
-    degree = DEGREE[settings.interpolation]
-    return light, degree, settings.max_iterations, settings.tolerance, settings.min_score
+def packed(reference: Reference) -> Tensor:
+    """The templates (B, bytes) as the C++ reads them: 16-bit images, made once for as long as the reference lives."""
+    made = _packed.get(reference.K)
+    if made is None:
+        criterion = reference.criterion
+        code = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else CODE[type(criterion)]
+        made = _packed[reference.K] = torch.ops.torch_ecc.pack.default(list(reference[1:]), code)
+    return made
+
+
+def _options(settings: Settings) -> tuple[int | float, ...]:
+    return DEGREE[settings.interpolation], settings.max_iterations, settings.tolerance, settings.min_score
 
 
 @lru_cache(maxsize=2)

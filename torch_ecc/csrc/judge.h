@@ -9,8 +9,7 @@ namespace ecc {
 
 enum Status : int8_t { CONVERGED, MAX_ITERATIONS, LOST, OUT_OF_VIEW, LOW_TEXTURE };
 constexpr double LARGEST_SIGMA = 0.5, NOISE_SHARE = 0.6, DOUBTFUL_SHARE = 0.5, PI = 3.14159265358979323846;
-constexpr int64_t FEW_BLOCKS = 4, BLOCK = 6;
-constexpr int MOST_COLUMNS = 10;
+constexpr int64_t FEW_BLOCKS = 4;
 
 inline bool good(int status) { return status == CONVERGED || status == MAX_ITERATIONS; }
 
@@ -52,52 +51,70 @@ inline bool safe_inverse(const Matrix& matrix, Matrix& inverse) {
   return regular;
 }
 
-struct Moments {  // sums over the pixels, the grey levels counted from one of their own
-  double w = 0, wt = 0, wg = 0, wtt = 0, wgg = 0, wtg = 0, t = 0, g = 0, count = 0;
+struct Remains {  // of a patch v after the fit, and before it: weighted sums, and what K's rows make of the rest
+  double square = 0, v = 0, vv = 0, vt = 0;  // of the rest squared; of v, v^2 and v (t - level)
+  double clustered[3] = {0, 0, 0};           // of the squared sums over blocks
 };
 
-inline Moments moments(const Template& t, const float* patch, float level, float grey) {
-  Moments m;
-  for (int64_t first = 0; first < t.n; first += CHUNK) {
-    const int n = int(std::min<int64_t>(CHUNK, t.n - first));
-    const float *weight = t.weight + first, *T = t.level + first, *G = patch + first;
-    float s[8] = {};
-    int count = 0;
-    for (int i = 0; i < n; ++i) {
-      const float w = weight[i], a = T[i] - level, b = G[i] - grey;
-      s[0] += w;
-      s[1] += w * a;
-      s[2] += w * b;
-      s[3] += w * a * a;
-      s[4] += w * b * b;
-      s[5] += w * a * b;
-      s[6] += a;
-      s[7] += b;
-      count += w > 0;
+// One pass over the patch, a row of blocks at a time.
+inline Remains remains(const Template& t, Scratch& scratch) {
+  const Pixels& p = t.whole;
+  const int16_t* rt = t.at<int16_t>(p.r.at[2]);
+  const float* weight = t.at<float>(p.weight);
+  float *const lines = scratch.lines.data(), *const rest = lines + MOST * p.pitch;
+  Remains out;
+  for (int64_t first = 0; first < p.height; first += BLOCK) {
+    const int64_t rows = std::min(BLOCK, p.height - first);
+    const float* const patch = scratch.patch.data() + first * p.pitch;
+    residual(t, first, rows, scratch.u, patch, rest);
+    Vector sums[4] = {};
+    for (int64_t j = 0; j < rows; ++j)
+      for (int64_t i = 0; i < p.pitch; i += LANES) {
+        const Vector w = load<Vector>(weight + (first + j) * p.weight_pitch + i), r = load<Vector>(rest + j * p.pitch + i);
+        const Vector v = load<Vector>(patch + j * p.pitch + i), wv = w * v;
+        sums[0] += w * r * r;
+        sums[1] += wv;
+        sums[2] += wv * v;
+        sums[3] += wv * wide(rt + (first + j) * p.pitch + i);
+      }
+    double* const totals[] = {&out.square, &out.v, &out.vv, &out.vt};
+    for (int k = 0; k < 4; ++k)
+      for (int l = 0; l < LANES; ++l) *totals[k] += double(sums[k][l]) * (k == 3 ? p.r.grey : 1);
+    products(t, p, first, rows, rest, lines);
+    for (int k = 0; k < 3; ++k) {
+      std::fill(rest, rest + p.pitch, 0.f);
+      for (int64_t c = 0; c < p.columns; ++c)
+        for (int64_t i = 0; i < p.pitch; ++i) rest[i] += float(p.inverse[k][c]) * lines[c * p.pitch + i];
+      for (int64_t i = 0; i < p.width; i += BLOCK) {
+        const double sum = std::accumulate(rest + i, rest + std::min(i + BLOCK, p.width), 0.0);
+        out.clustered[k] += sum * sum;
+      }
     }
-    double* sums[] = {&m.w, &m.wt, &m.wg, &m.wtt, &m.wgg, &m.wtg, &m.t, &m.g};
-    for (int k = 0; k < 8; ++k) *sums[k] += s[k];
-    m.count += count;
   }
-  return m;
+  return out;
 }
 
 // judge.flat_correlation: what is left of the correlation when both lose their planes 1, x', y'.
-inline double flat_correlation(const Template& t, const float* patch, float level, float grey) {
+inline double flat_correlation(const Template& t, const float* patch) {
+  const Pixels& p = t.whole;
+  const int16_t* rt = t.at<int16_t>(p.r.at[2]);
+  const float* weight = t.at<float>(p.weight);
   Matrix normal{}, inverse;
   double a[3] = {}, b[3] = {}, tt = 0, gg = 0, tg = 0;
-  for (int64_t i = 0; i < t.n; ++i) {
-    const double w = t.weight[i], T = t.level[i] - level, g = patch[i] - grey;
-    const double plane[3] = {1, t.px[i] / t.radius, t.py[i] / t.radius};
-    for (int j = 0; j < 3; ++j) {
-      for (int k = 0; k < 3; ++k) normal[3 * j + k] += w * plane[j] * plane[k];
-      a[j] += w * plane[j] * T;
-      b[j] += w * plane[j] * g;
+  for (int64_t y = 0; y < p.height; ++y)
+    for (int64_t x = 0; x < p.width; ++x) {
+      const double w = weight[y * p.weight_pitch + x], T = double(p.r.grey) * rt[y * p.pitch + x];
+      const double g = patch[y * p.pitch + x];
+      const double plane[3] = {1, (p.left + double(x)) / t.radius, (p.top + double(y)) / t.radius};
+      for (int j = 0; j < 3; ++j) {
+        for (int k = 0; k < 3; ++k) normal[3 * j + k] += w * plane[j] * plane[k];
+        a[j] += w * plane[j] * T;
+        b[j] += w * plane[j] * g;
+      }
+      tt += w * T * T;
+      gg += w * g * g;
+      tg += w * T * g;
     }
-    tt += w * T * T;
-    gg += w * g * g;
-    tg += w * T * g;
-  }
   const double whole = gg;
   safe_inverse(normal, inverse);
   for (int j = 0; j < 3; ++j)
@@ -107,67 +124,6 @@ inline double flat_correlation(const Template& t, const float* patch, float leve
       tg -= a[j] * inverse[3 * j + k] * b[k];
     }
   return tt > 0 && gg > 1e-12 * whole ? std::clamp(tg / std::sqrt(tt * gg), -1.0, 1.0) : 0;
-}
-
-struct Remains {  // of a patch after the fit: weighted square sum, square sums of K's rows and of the blocks' sums
-  double square = 0, white[3] = {0, 0, 0}, clustered[3] = {0, 0, 0};
-};
-
-// Criterion.fit of n pixels from `first` on: r = g - columns u, t and g less their means.
-inline void residual(const Template& t, int64_t first, int64_t n, const float* patch, const float* u, float level,
-                     float grey, float* __restrict r) {
-  const float *G = t.signal + first, *px = t.px + first, *py = t.py + first;
-  const float cx = float(t.centre[0]), sx = float(2 / std::max(t.box[0][2] - t.box[0][0], 1.0));
-  const float cy = float(t.centre[1]), sy = float(2 / std::max(t.box[1][2] - t.box[1][0], 1.0));
-  for (int64_t i = 0; i < n; ++i) {
-    const float T = t.level[first + i], x = (px[i] - cx) * sx, y = (py[i] - cy) * sy;
-    const float light = u[5] * x + u[6] * y + u[7] * x * x + u[8] * y * y + u[9] * x * y;
-    const float motion = u[0] * G[i] + u[1] * G[t.n + i] + u[2] * G[2 * t.n + i];
-    r[i] = patch[first + i] - grey - (motion + u[3] * (T - level) + u[4] + light * T);
-  }
-}
-
-// The residual's power and the sums of judge.clustering, row by row; `lines` is room for four rows.
-inline Remains remains(const Template& t, const float* patch, const float* u, float level, float grey,
-                       std::vector<float>& lines) {
-  const int64_t width = int64_t(t.box[0][2] - t.box[0][0]) + 1;
-  lines.assign(4 * width, 0.f);
-  float* const r = lines.data();
-  float* const line[3] = {r + width, r + 2 * width, r + 3 * width};  // sums down the columns of a row of blocks
-  const auto band = [&](int64_t i) { return int64_t(double(t.py[i]) - t.box[1][0]) / BLOCK; };
-  Remains out;
-  for (int64_t first = 0, last; first < t.n; first = last) {
-    last = first + width;
-    const bool full = last <= t.n && t.py[last - 1] == t.py[first];
-    if (!full)
-      for (last = first; last < t.n && t.py[last] == t.py[first];) ++last;
-    const int64_t n = last - first;
-    residual(t, first, n, patch, u, level, grey, r);
-    const float* weight = t.weight + first;
-    float square = 0;
-    for (int64_t i = 0; i < n; ++i) square += weight[i] * r[i] * r[i];
-    out.square += square;
-    for (int k = 0; k < 3; ++k) {
-      const float* K = t.K + k * t.n + first;
-      float white = 0;
-      for (int64_t i = 0; i < n; ++i) white += K[i] * K[i];
-      out.white[k] += white;
-      float* __restrict sum = line[k];
-      if (full)
-        for (int64_t i = 0; i < n; ++i) sum[i] += K[i] * r[i];
-      else  // a mask has gaps
-        for (int64_t i = 0; i < n; ++i) sum[int64_t(double(t.px[first + i]) - t.box[0][0])] += K[i] * r[i];
-    }
-    if (last < t.n && band(last) == band(first)) continue;
-    for (int k = 0; k < 3; ++k) {
-      for (int64_t left = 0; left < width; left += BLOCK) {
-        const double sum = std::accumulate(line[k] + left, line[k] + std::min(left + BLOCK, width), 0.0);
-        out.clustered[k] += sum * sum;
-      }
-      std::fill(line[k], line[k] + width, 0.f);
-    }
-  }
-  return out;
 }
 
 inline double alike(double step, double count) {
@@ -207,42 +163,23 @@ inline bool covariance(const Template& t, double noise, double gain, const doubl
 inline double finite(double value) { return std::isfinite(value) ? value : 0; }
 
 inline Verdict judge(const Template& t, const Settings& set, const State& state, Scratch& scratch) {
-  const float* patch = scratch.patch.data();
-  float level = t.level[t.n / 2], grey = patch[t.n / 2];
-  const Moments m = moments(t, patch, level, grey);
-  const double dt = std::sqrt(std::max(m.wtt - m.wt * m.wt / m.w, 0.0)),
-               dg = std::sqrt(std::max(m.wgg - m.wg * m.wg / m.w, 0.0));
-  const double raw = m.wgg + 2 * grey * m.wg + double(grey) * grey * m.w;
+  const Remains left = remains(t, scratch);
+  const double about = scratch.about, dt = std::sqrt(std::max(t.wtt - t.wt * t.wt / t.w, 0.0)),
+               dg = std::sqrt(std::max(left.vv - left.v * left.v / t.w, 0.0));
   Verdict v;
-  v.score = dt * dg > 1e-12 * raw ? std::clamp((m.wtg - m.wt * m.wg / m.w) / (dt * dg), -1.0, 1.0) : 0;
-  float u[MOST_COLUMNS] = {0, 0, 0, 1};  // SSD: t as it is
-  if (t.light == SSD) {
-    grey = level;
-  } else {
-    level += float(m.t / double(t.n));
-    grey += float(m.g / double(t.n));
-    for (int64_t r = 0; r < t.p; ++r) {
-      double sum = r < 4 ? scratch.u[r] : 0;  // the step has needed these
-      for (int64_t first = 0; r >= 4 && first < t.n; first += CHUNK) {
-        float part = 0;
-        for (int64_t i = first; i < std::min<int64_t>(first + CHUNK, t.n); ++i)
-          part += t.K[r * t.n + i] * (patch[i] - grey);
-        sum += part;
-      }
-      u[r] = float(sum);
-    }
-  }
-  const double alike = v.score >= set.min_score ? v.score : std::max(v.score, flat_correlation(t, patch, level, grey));
-  const Remains left = remains(t, patch, u, level, grey, scratch.lines);
-  const double gain = finite(u[3]);
-  v.power = finite(left.square / std::max(m.w, 1e-30));
+  v.score = dt * dg > 1e-12 * (left.vv + 2 * about * left.v + about * about * t.w)
+                ? std::clamp((left.vt - t.wt * left.v / t.w) / (dt * dg), -1.0, 1.0)
+                : 0;
+  const double alike = v.score >= set.min_score ? v.score : std::max(v.score, flat_correlation(t, scratch.patch.data()));
+  const double gain = finite(scratch.u[3]);
+  v.power = finite(left.square / std::max(t.w, 1e-30));
   constexpr double NOISE_GAIN[] = {4.0 / 9, 0.7643, 0.8427};  // sampling.NOISE_GAIN
-  const double noise = v.power * m.count / std::max(m.count - double(t.p), 1.0) /
+  const double noise = v.power * double(t.count) / std::max(double(t.count) - double(t.columns), 1.0) /
                        (gain * gain + NOISE_GAIN[set.degree / 2]);
   double structure[3] = {1, 1, 1};
-  for (int k = 0; k < 3 && t.blocks >= FEW_BLOCKS * t.p; ++k) {
-    const double few = double(t.blocks) / double(t.blocks - t.p);
-    const double white = std::max(left.white[k] * noise * (1 + gain * gain), 1e-30);
+  for (int k = 0; k < 3 && t.blocks >= FEW_BLOCKS * t.columns; ++k) {
+    const double few = double(t.blocks) / double(t.blocks - t.columns);
+    const double white = std::max(t.white[k] * noise * (1 + gain * gain), 1e-30);
     structure[k] = std::sqrt(std::max(few * left.clustered[k] / white, 1.0));
   }
   const bool fixed = covariance(t, noise, gain, structure, state.pose, set.degree, v.covariance);

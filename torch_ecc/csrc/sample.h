@@ -1,87 +1,109 @@
-// Values of a window between its pixels: bilinear (degree 1) and B-spline (3, 5), some hundred points at a time.
+// Values of a window between its pixels, row by row of a template: bilinear (degree 1) and B-spline (3, 5).
 #pragma once
-#include <cstring>
-
 #include "window.h"
 
 namespace ecc {
-
-constexpr int CHUNK = 256;
 
 struct Warp {  // template pixel (x', y') to the frame: x = c x' + s y' + x0, y = -s x' + c y' + y0 (eq. 2)
   double c, s, x0, y0;
 };
 
-// Weights of the degree + 1 B-spline taps around points with fractional parts f.
+struct Line {  // n points x + k dx, y + k dy; (0, 0) is where the first tap of a point is the window's first value
+  float x, y, dx, dy;
+  int n;
+};
+
+// Weights of the degree + 1 B-spline taps around a point with the fractional part t; of one point, or of a vector.
+template <int degree, class Real>
+void weigh(Real t, Real (&w)[degree + 1]) {
+  const Real r = 1 - t;
+  if constexpr (degree == 1) {
+    w[0] = r;
+    w[1] = t;
+  } else if constexpr (degree == 3) {
+    const Real t2 = t * t, r2 = r * r;
+    w[0] = r2 * r * (1.f / 6);
+    w[3] = t2 * t * (1.f / 6);
+    w[1] = t2 * (0.5f * t - 1.f) + 2.f / 3;
+    w[2] = r2 * (0.5f * r - 1.f) + 2.f / 3;
+  } else {
+    const Real t2 = t * t, r2 = r * r;
+    w[0] = r2 * r2 * r * (1.f / 120);
+    w[5] = t2 * t2 * t * (1.f / 120);
+    // The quintic at 1 + t, 2 - t and at t, 1 - t, in powers of the distance to the nearer knot.
+    w[1] = (1.f + r * (5.f + r * (10.f + r * (10.f + r * (5.f - 5.f * r))))) * (1.f / 120);
+    w[4] = (1.f + t * (5.f + t * (10.f + t * (10.f + t * (5.f - 5.f * t))))) * (1.f / 120);
+    w[2] = 11.f / 20 + t2 * (t2 * (0.25f - t * (1.f / 12)) - 0.5f);
+    w[3] = 11.f / 20 + r2 * (r2 * (0.25f - r * (1.f / 12)) - 0.5f);
+  }
+}
+
+// Neighbours on a line that turns little have neighbouring taps: up to where the line crosses into the next row or
+// column, every tap of theirs is one vector as it stands in memory. Writes whole vectors, from where the next run
+// or nothing of worth follows.
 template <int degree>
-void weigh(const float* f, int n, float (&w)[degree + 1][CHUNK]) {
-  for (int i = 0; i < n; ++i) {
-    const float t = f[i], r = 1 - t;
-    if constexpr (degree == 3) {
-      w[0][i] = r * r * r * (1.f / 6);
-      w[3][i] = t * t * t * (1.f / 6);
-      w[1][i] = 2.f / 3 + t * t * (0.5f * t - 1);
-      w[2][i] = 2.f / 3 + r * r * (0.5f * r - 1);
-    } else {
-      const float t2 = t * t, r2 = r * r;
-      w[0][i] = r2 * r2 * r * (1.f / 120);
-      w[5][i] = t2 * t2 * t * (1.f / 120);
-      // The quintic at 1 + t, 2 - t and at t, 1 - t, in powers of the distance to the nearer knot.
-      w[1][i] = (1 + r * (5 + r * (10 + r * (10 + r * (5 - 5 * r))))) * (1.f / 120);
-      w[4][i] = (1 + t * (5 + t * (10 + t * (10 + t * (5 - 5 * t))))) * (1.f / 120);
-      w[2][i] = 11.f / 20 + t2 * (-0.5f + t2 * (0.25f - t * (1.f / 12)));
-      w[3][i] = 11.f / 20 + r2 * (-0.5f + r2 * (0.25f - r * (1.f / 12)));
+void sample_runs(const Window& window, const Line& line, float* out) {
+  constexpr int taps = degree + 1;
+  const int64_t pitch = window.pitch(), right = window.w - taps, bottom = window.h - taps;
+  const float drift = line.dx - 1, across = std::abs(line.dy);
+  const float per_column = -1 / std::min(drift, -1e-9f), per_row = 1 / std::max(across, 1e-9f);
+  Vector lane;
+  for (int k = 0; k < LANES; ++k) lane[k] = float(k);
+  for (int first = 0, last; first < line.n; first = last) {
+    const float x = line.x + float(first) * line.dx, y = line.y + float(first) * line.dy;
+    const int64_t ix = std::clamp<int64_t>(int64_t(x), 0, right), iy = std::clamp<int64_t>(int64_t(y), 0, bottom);
+    const float fx = x - float(ix), fy = y - float(iy);
+    const float room = std::min(fx * per_column, (line.dy < 0 ? fy : 1 - fy) * per_row);
+    last = first + 1 + int(std::clamp(room, 0.f, float(line.n)));
+    last = std::min(last, line.n);
+    const float* from = window.values.data() + iy * pitch + ix;
+    for (int i = first; i < last; i += LANES, from += LANES) {
+      Vector wx[taps], wy[taps], sum{};
+      const Vector along = lane + float(i - first);
+      weigh<degree, Vector>(fx + drift * along, wx);
+      weigh<degree, Vector>(fy + line.dy * along, wy);
+      for (int k = 0; k < taps; ++k) {
+        Vector row = wx[0] * load<Vector>(from + k * pitch);
+        for (int l = 1; l < taps; ++l) row += wx[l] * load<Vector>(from + k * pitch + l);
+        sum += wy[k] * row;
+      }
+      store(sum, out + i);
     }
   }
 }
 
-// Positions of n points in a window, rounded down, and what is left of them: held to where all taps exist.
+// Any line, point by point.
 template <int degree>
-void locate(const Window& window, const Warp& warp, const float* __restrict px, const float* __restrict py, int n,
-            float* __restrict fx, float* __restrict fy, int32_t* __restrict place) {
+void sample_points(const Window& window, const Line& line, float* __restrict out) {
+  constexpr int taps = degree + 1, CHUNK = 64, size = degree == 1 ? 2 : degree == 3 ? 4 : 8;  // of a row's taps
+  typedef float Taps __attribute__((vector_size(4 * size)));
   constexpr float BELOW_ONE = 0.99999f;
-  const float c = float(warp.c), s = float(warp.s), x0 = float(warp.x0 - double(window.x0 + degree / 2)),
-              y0 = float(warp.y0 - double(window.y0 + degree / 2));
-  const float right = float(window.w - degree - 1) + BELOW_ONE, bottom = float(window.h - degree - 1) + BELOW_ONE;
-  const int32_t pitch = int32_t(window.pitch());
-  for (int i = 0; i < n; ++i) {
-    const float x = std::clamp(c * px[i] + s * py[i] + x0, 0.f, right);
-    const float y = std::clamp(c * py[i] - s * px[i] + y0, 0.f, bottom);
-    const int32_t ix = int32_t(x), iy = int32_t(y);
-    fx[i] = x - float(ix);
-    fy[i] = y - float(iy);
-    place[i] = iy * pitch + ix;
-  }
-}
-
-// g[i] = value at the warped (px[i], py[i]), i < n <= CHUNK.
-template <int degree>
-void sample(const Window& window, const Warp& warp, const float* px, const float* py, int n, float* __restrict g) {
-  constexpr int taps = degree + 1, size = degree == 3 ? 4 : 8;  // of a vector that holds the taps of a row
-  typedef float Vector __attribute__((vector_size(4 * size)));
-  float fx[CHUNK], fy[CHUNK];
-  int32_t place[CHUNK];
-  locate<degree>(window, warp, px, py, n, fx, fy, place);
+  const float right = float(window.w - taps) + BELOW_ONE, bottom = float(window.h - taps) + BELOW_ONE;
   const int32_t pitch = int32_t(window.pitch());
   const float* const from = window.values.data();
-  if constexpr (degree == 1) {
-    alignas(64) float above[2 * CHUNK], below[2 * CHUNK];
+  alignas(64) float fx[CHUNK], fy[CHUNK], row[CHUNK * size], wx[taps][CHUNK], wy[taps][CHUNK];
+  int32_t place[CHUNK];
+  for (int first = 0; first < line.n; first += CHUNK) {
+    const int n = std::min(line.n - first, CHUNK);
     for (int i = 0; i < n; ++i) {
-      std::memcpy(above + 2 * i, from + place[i], 8);
-      std::memcpy(below + 2 * i, from + place[i] + pitch, 8);
+      const float x = std::clamp(line.x + float(first + i) * line.dx, 0.f, right);
+      const float y = std::clamp(line.y + float(first + i) * line.dy, 0.f, bottom);
+      const int32_t ix = int32_t(x), iy = int32_t(y);
+      fx[i] = x - float(ix);
+      fy[i] = y - float(iy);
+      place[i] = iy * pitch + ix;
     }
     for (int i = 0; i < n; ++i) {
-      const float a = above[2 * i] + fx[i] * (above[2 * i + 1] - above[2 * i]);
-      const float b = below[2 * i] + fx[i] * (below[2 * i + 1] - below[2 * i]);
-      g[i] = a + fy[i] * (b - a);
+      float x[taps], y[taps];
+      weigh<degree, float>(fx[i], x);
+      weigh<degree, float>(fy[i], y);
+      for (int k = 0; k < taps; ++k) {
+        wx[k][i] = x[k];
+        wy[k][i] = y[k];
+      }
     }
-  } else {
-    float wx[taps][CHUNK], wy[taps][CHUNK];
-    alignas(64) float row[CHUNK * size];
-    weigh<degree>(fx, n, wx);
-    weigh<degree>(fy, n, wy);
     for (int i = 0; i < n; ++i) {  // down the columns first, for all taps of a row at once
-      Vector sum{}, next;
+      Taps sum{}, next;
       for (int k = 0; k < taps; ++k) {
         std::memcpy(&next, from + place[i] + k * pitch, sizeof next);
         sum += next * wy[k][i];
@@ -91,9 +113,18 @@ void sample(const Window& window, const Warp& warp, const float* px, const float
     for (int i = 0; i < n; ++i) {
       float sum = 0;
       for (int k = 0; k < taps; ++k) sum += wx[k][i] * row[i * size + k];
-      g[i] = sum;
+      out[first + i] = sum;
     }
   }
+}
+
+template <int degree>
+void sample(const Window& window, const Line& line, float* out) {
+  constexpr float STRAIGHT = 0.15f;  // rows crossed per px up to which runs are long enough to pay
+  if (line.dx > 0.9f && line.dx <= 1 && std::abs(line.dy) < STRAIGHT)
+    sample_runs<degree>(window, line, out);
+  else
+    sample_points<degree>(window, line, out);
 }
 
 }  // namespace ecc

@@ -5,40 +5,14 @@
 #include <ATen/ops/empty_like.h>
 #include <torch/library.h>
 
+#include <atomic>
+
 #include "judge.h"
+#include "pack.h"
 
 namespace {
 
 using at::Tensor;
-
-// The tensors of torch_ecc.Reference in their order, without the criterion.
-enum Field { PIXELS, BOX, BLOCK, BLOCK_SIZES, CENTRE, RADIUS, NOISE, SIGNAL, INSTRUMENT, TRUST, WEIGHT, ALIAS, K, SLOPE,
-             SPREAD, INFLATION, SPREAD_NOISE, SHARE, SPARSE, K_SPARSE };
-
-struct Fields {
-  std::vector<Tensor> all;
-  int light;
-
-  ecc::Template at(int64_t b) const {
-    const int64_t n = all[PIXELS].size(1), p = all[K].size(1);
-    const auto f = [&](Field k, int64_t each) { return all[k].const_data_ptr<float>() + b * each; };
-    const auto d = [&](Field k, int64_t each) { return all[k].const_data_ptr<double>() + b * each; };
-    const float *pixels = all[PIXELS].const_data_ptr<float>(), *box = all[BOX].const_data_ptr<float>();
-    ecc::Template t{n, p, all[BLOCK_SIZES].size(0), light, pixels, pixels + n, f(K, p * n), f(SIGNAL, 4 * n), f(SIGNAL, 4 * n) + 3 * n,
-                    f(WEIGHT, all[WEIGHT].size(0) == 1 ? 0 : n)};
-    for (int k = 0; k < 8; ++k) t.box[k / 4][k % 4] = box[k];
-    for (int k = 0; k < 2; ++k) t.centre[k] = f(CENTRE, 2)[k];
-    t.radius = *d(RADIUS, 1);
-    t.noise = *f(NOISE, 1);
-    t.noise_share = *d(SHARE, 1);
-    t.alias = d(ALIAS, 12);
-    t.slope = d(SLOPE, 9);
-    t.spread = d(SPREAD, 9);
-    t.inflation = d(INFLATION, 9);
-    t.spread_noise = d(SPREAD_NOISE, 9);
-    return t;
-  }
-};
 
 ecc::Frame frame_of(const Tensor& image, int64_t b) {
   const auto kind = image.scalar_type();
@@ -56,13 +30,10 @@ struct Outcome {  // the fields of Estimate, and how many templates have a statu
   std::vector<Tensor> fields() const { return {pose, displacement, score, status, iterations, covariance, residual}; }
 };
 
-// image (1 or B, 1, H, W) uint8, uint16 or float32 and poses to start from (B, 3) float64. Templates at the frame's
-// border, where pixels drop out, are not settled: status -1.
-Outcome align(const Tensor& image, at::TensorList reference, const Tensor& start, int64_t light,
-              const ecc::Settings& set) {
+// image (1 or B, 1, H, W) uint8, uint16 or float32, templates (B, bytes) of pack, poses to start from (B, 3) float64.
+// Templates at the frame's border, where pixels drop out, are not settled: status -1.
+Outcome align(const Tensor& image, const Tensor& templates, const Tensor& start, const ecc::Settings& set) {
   const Tensor rows = image.stride(3) == 1 ? image : image.contiguous(), poses = start.contiguous();
-  Fields fields{{}, int(light)};
-  for (const Tensor& tensor : reference) fields.all.push_back(tensor.contiguous());
   const int64_t count = poses.size(0);
   const auto real = poses.options();
   Outcome out{at::empty({count, 3}, real), at::empty({count, 3}, real), at::empty({count}, real),
@@ -73,19 +44,16 @@ Outcome align(const Tensor& image, at::TensorList reference, const Tensor& start
          *residual = out.residual.data_ptr<double>();
   int8_t* status = out.status.data_ptr<int8_t>();
   int64_t* iterations = out.iterations.data_ptr<int64_t>();
-  at::parallel_for(0, count, 1, [&](int64_t first, int64_t last) {
+  std::atomic<int64_t> next{0};  // each thread takes the next one: they are not equally much work
+  at::parallel_for(0, std::min<int64_t>(count, at::get_num_threads()), 1, [&](int64_t, int64_t) {
     thread_local ecc::Scratch scratch;
-    thread_local ecc::Thin thin;
-    for (int64_t b = first; b < last; ++b) {
-      const ecc::Template t = fields.at(b);
-      const int64_t few = fields.all[SPARSE].size(0);
-      thin.gather(t, fields.all[SPARSE].const_data_ptr<int64_t>(), few,
-                  fields.all[K_SPARSE].const_data_ptr<float>() + b * t.p * few);
+    for (int64_t b = next++; b < count; b = next++) {
+      const auto& t = *reinterpret_cast<const ecc::Template*>(templates.const_data_ptr<uint8_t>() + b * templates.size(1));
       const double* from = poses.const_data_ptr<double>() + 3 * b;
       ecc::State state{{from[0], from[1], from[2]}};
       ecc::Verdict verdict{};
       verdict.status = ecc::Status(-1);
-      if (ecc::refine(t, thin.t, frame_of(rows, b), set, state, scratch)) verdict = ecc::judge(t, set, state, scratch);
+      if (ecc::refine(t, frame_of(rows, b), set, state, scratch)) verdict = ecc::judge(t, set, state, scratch);
       const bool good = ecc::good(verdict.status);
       for (int k = 0; k < 3; ++k) {
         pose[3 * b + k] = good ? state.pose[k] : from[k];
@@ -102,18 +70,19 @@ Outcome align(const Tensor& image, at::TensorList reference, const Tensor& start
   return out;
 }
 
-std::tuple<std::vector<Tensor>, int64_t> solve(const Tensor& image, at::TensorList reference, const Tensor& pose,
-                                               int64_t light, int64_t degree, int64_t max_iterations, double tolerance,
+Tensor pack(at::TensorList reference, int64_t criterion) { return ecc::Packer(reference, criterion).pack(); }
+
+std::tuple<std::vector<Tensor>, int64_t> solve(const Tensor& image, const Tensor& templates, const Tensor& pose,
+                                               int64_t degree, int64_t max_iterations, double tolerance,
                                                double min_score) {
-  const Outcome out = align(image, reference, pose, light, {degree, max_iterations, tolerance, min_score});
+  const Outcome out = align(image, templates, pose, {degree, max_iterations, tolerance, min_score});
   return {out.fields(), out.unsettled};
 }
 
 // One frame of Tracker: state = [pose, velocity, start, score, tracked, doubted] -> the fields of Estimate and the next
 // state; or nothing if the torch path is needed, for templates at the border, or if there are some to be searched for.
-std::vector<Tensor> track(const Tensor& image, at::TensorList reference, at::TensorList state, int64_t light,
-                          int64_t degree, int64_t max_iterations, double tolerance, double min_score, bool hold,
-                          bool search) {
+std::vector<Tensor> track(const Tensor& image, const Tensor& templates, at::TensorList state, int64_t degree,
+                          int64_t max_iterations, double tolerance, double min_score, bool hold, bool search) {
   const int64_t count = state[0].size(0);
   std::vector<Tensor> now, next;
   for (const Tensor& tensor : state) {
@@ -125,7 +94,7 @@ std::vector<Tensor> track(const Tensor& image, at::TensorList reference, at::Ten
   double *next_pose = next[0].data_ptr<double>(), *next_velocity = next[1].data_ptr<double>();
   next[2] = now[2];
   for (int64_t b = 0; b < count; ++b) ecc::compose(pose + 3 * b, velocity + 3 * b, next_pose + 3 * b);
-  const Outcome out = align(image, reference, next[0], light, {degree, max_iterations, tolerance, min_score});
+  const Outcome out = align(image, templates, next[0], {degree, max_iterations, tolerance, min_score});
   const double* score = out.score.const_data_ptr<double>();
   const int8_t* status = out.status.const_data_ptr<int8_t>();
   const auto strange = [&](int64_t b) {  // Tracker._strange
@@ -156,15 +125,17 @@ std::vector<Tensor> track(const Tensor& image, at::TensorList reference, at::Ten
 }  // namespace
 
 TORCH_LIBRARY(torch_ecc, m) {
+  m.def("pack(Tensor[] reference, int criterion) -> Tensor");
   m.def(
-      "solve(Tensor image, Tensor[] reference, Tensor pose, int light, int degree, int max_iterations, "
-      "float tolerance, float min_score) -> (Tensor[], int)");
+      "solve(Tensor image, Tensor templates, Tensor pose, int degree, int max_iterations, float tolerance, "
+      "float min_score) -> (Tensor[], int)");
   m.def(
-      "track(Tensor image, Tensor[] reference, Tensor[] state, int light, int degree, int max_iterations, "
-      "float tolerance, float min_score, bool hold, bool search) -> Tensor[]");
+      "track(Tensor image, Tensor templates, Tensor[] state, int degree, int max_iterations, float tolerance, "
+      "float min_score, bool hold, bool search) -> Tensor[]");
 }
 
 TORCH_LIBRARY_IMPL(torch_ecc, CPU, m) {
+  m.impl("pack", &pack);
   m.impl("solve", &solve);
   m.impl("track", &track);
 }

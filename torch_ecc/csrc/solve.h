@@ -1,21 +1,12 @@
 // The loop of torch_ecc/solver.py for one template: see there for the reasons behind each step and constant.
 #pragma once
-#include "sample.h"
+#include "template.h"
 
 namespace ecc {
 
 constexpr double COARSE_TOLERANCE = 0.02, SECANT_RANGE = 1.0, LARGEST_STRETCH = 5.0, LONGEST_STEP = 0.2;
 constexpr double EDGE = 4, INFINITE = HUGE_VAL;
 constexpr double MEMORY = 0.05, WORSE = 1.5, SLACK = 0.01;  // tracker.MEMORY, locate.AS_GOOD
-constexpr int SSD = -1;  // in place of a number of light columns
-
-struct Template {  // one template of torch_ecc.Reference: N pixels, p columns
-  int64_t n, p, blocks;
-  int light;  // columns of light beside t, or SSD
-  const float *px, *py, *K, *signal, *level, *weight;  // level: the grey levels, after G in signal
-  double box[2][4], centre[2], radius, noise, noise_share;
-  const double *alias, *slope, *spread, *inflation, *spread_noise;
-};
 
 struct State {
   double pose[3], delta[3] = {0, 0, 0}, factor = 1, error = INFINITE;
@@ -29,8 +20,9 @@ struct Settings {
 
 struct Scratch {  // of one thread, kept from call to call
   Window window;
-  std::vector<float> patch, lines;
-  double u[4];  // K's first rows times the patch
+  std::vector<float> patch, lines;  // the last sampled patch, (height, pitch), less the grey level `about`
+  float about;
+  Sums u;  // what the patch is made of: coefficients of the criterion's columns
 };
 
 // pose.compose, and pose.compose(pose.inverse(a), b).
@@ -48,17 +40,16 @@ inline void between(const double* a, const double* b, double* out) {
   out[2] = b[2] - a[2];
 }
 
-inline Warp warp_of(const Template& t, const double (&pose)[3]) {
-  const double c = std::cos(pose[2]), s = std::sin(pose[2]);
-  return {c, s, pose[0] - c * t.centre[0] - s * t.centre[1], pose[1] + s * t.centre[0] - c * t.centre[1]};
-}
+// Of pixel positions relative to the template's centre.
+inline Warp warp_of(const double (&pose)[3]) { return {std::cos(pose[2]), std::sin(pose[2]), pose[0], pose[1]}; }
 
 // Smallest rectangle around the warped template.
 inline void bounds(const Template& t, const Warp& w, double (&low)[2], double (&high)[2]) {
   low[0] = low[1] = INFINITE;
   high[0] = high[1] = -INFINITE;
   for (int k = 0; k < 4; ++k) {
-    const double point[2] = {w.c * t.box[0][k] + w.s * t.box[1][k] + w.x0, w.c * t.box[1][k] - w.s * t.box[0][k] + w.y0};
+    const double x = t.box[0][k] - t.centre[0], y = t.box[1][k] - t.centre[1];
+    const double point[2] = {w.c * x + w.s * y + w.x0, w.c * y - w.s * x + w.y0};
     for (int d = 0; d < 2; ++d) {
       low[d] = std::min(low[d], point[d]);
       high[d] = std::max(high[d], point[d]);
@@ -68,7 +59,7 @@ inline void bounds(const Template& t, const Warp& w, double (&low)[2], double (&
 
 inline bool inside(const Template& t, const double (&pose)[3], const Frame& frame, double margin) {
   double low[2], high[2];
-  bounds(t, warp_of(t, pose), low, high);
+  bounds(t, warp_of(pose), low, high);
   return low[0] >= margin && low[1] >= margin && high[0] <= double(frame.w - 1) - margin &&
          high[1] <= double(frame.h - 1) - margin;
 }
@@ -84,38 +75,54 @@ void cover(const Template& t, const Frame& frame, const Warp& warp, Window& wind
   if (anew || !covered) open_window<degree>(frame, low, high, degree == 1 ? 4 : 1, window);
 }
 
-// Samples the patch and returns K_r g of the first rows, g less the template (SSD) or less a grey level near its mean:
-// the rows of K that serve are orthogonal to a constant, but the sums should stay small.
-template <int degree, int rows, bool ssd>
-void project(const Template& t, const Warp& warp, const Window& window, float* patch, double (&u)[rows]) {
-  std::fill(u, u + rows, 0.0);
-  float about = 0;
-  for (int64_t first = 0; first < t.n; first += CHUNK) {
-    const int n = int(std::min<int64_t>(CHUNK, t.n - first));
-    float* g = patch + first;
-    sample<degree>(window, warp, t.px + first, t.py + first, n, g);
-    if (first == 0) about = g[n / 2];
-    const float *K = t.K + first, *level = t.level + first;
-    float sum[rows] = {};
-    for (int i = 0; i < n; ++i) {
-      const float v = g[i] - (ssd ? level[i] : about);
-      for (int r = 0; r < rows; ++r) sum[r] += K[r * t.n + i] * v;
+// Samples the patch and returns Z W v. The sums that serve do not feel the level v is counted from, but stay small.
+template <int degree>
+Sums look(const Template& t, const Pixels& p, const Warp& warp, Scratch& scratch) {
+  const Window& window = scratch.window;
+  const double x0 = warp.x0 - double(window.x0 + degree / 2), y0 = warp.y0 - double(window.y0 + degree / 2);
+  Sums sums{};
+  for (int64_t first = 0; first < p.height; first += BLOCK) {
+    const int64_t rows = std::min(BLOCK, p.height - first);
+    float* const band = scratch.patch.data() + first * p.pitch;
+    for (int64_t j = 0; j < rows; ++j) {
+      const double y = p.top + double(first + j) * p.step;
+      sample<degree>(window,
+                     {float(warp.c * p.left + warp.s * y + x0), float(warp.c * y - warp.s * p.left + y0),
+                      float(warp.c * p.step), float(-warp.s * p.step), int(p.width)},
+                     band + j * p.pitch);
     }
-    for (int r = 0; r < rows; ++r) u[r] += sum[r];
+    if (first == 0) scratch.about = band[p.width / 2];
+    for (int64_t i = 0; i < rows * p.pitch; ++i) band[i] -= scratch.about;
+    products(t, p, first, rows, band, scratch.lines.data());
+    add_lines(t, p, scratch.lines.data(), sums);
   }
+  return sums;
 }
 
-// Criterion.step: false if the patch asks for no finite step.
-template <int degree>
-bool increment(const Template& t, const Warp& warp, Scratch& scratch, double (&step)[3]) {
-  if (t.light == SSD) {
-    project<degree, 3, true>(t, warp, scratch.window, scratch.patch.data(), step);
-  } else {
-    double(&u)[4] = scratch.u;
-    project<degree, 4, false>(t, warp, scratch.window, scratch.patch.data(), u);
+// Coefficients of all columns (Criterion.fit) from Z W v and the patch, and of those the step (Criterion.step).
+inline Sums coefficients(const Template& t, const Pixels& p, Sums sums, Scratch& scratch, double (&step)[3]) {
+  if (t.criterion >= 0) {
+    const Sums u = multiply(p, sums);
     for (int k = 0; k < 3; ++k) step[k] = u[k] / std::max(u[3], 0.0);
+    return u;
   }
-  return std::isfinite(step[0]) && std::isfinite(step[1]) && std::isfinite(step[2]);
+  Sums fit{0, 0, 0, 1, double(p.r.level) - scratch.about};  // v = t
+  if (t.criterion == PAPER) {                               // v less its mean, over t less its mean
+    double square = 0, w = p.of_one[4], wt = p.of_level[4];
+    const float* weight = t.at<float>(p.weight);
+    for (int64_t j = 0; j < p.height; ++j) {
+      float sum = 0;
+      const float* v = scratch.patch.data() + j * p.pitch;
+      for (int64_t i = 0; i < p.width; ++i) sum += weight[j * p.weight_pitch + i] * v[i] * v[i];
+      square += sum;
+    }
+    fit[3] = std::sqrt(std::max(square - sums[4] * sums[4] / w, 0.0)) / std::max(p.contrast, 1e-30);
+    fit[4] = sums[4] / w - fit[3] * wt / w;
+  }
+  for (int k = 0; k < 5; ++k) sums[k] -= fit[3] * p.of_level[k] + fit[4] * p.of_one[k];
+  const Sums u = multiply(p, sums);
+  for (int k = 0; k < 3; ++k) step[k] = u[k] / fit[3];
+  return fit;
 }
 
 // solver.gauss_newton after the step is known: secant stretch, update (eq. 10), predicted error.
@@ -145,13 +152,15 @@ inline void advance(const Template& t, const double (&step)[3], State& state) {
 }
 
 template <int degree>
-void iterate(const Template& t, const Frame& frame, double tolerance, int64_t budget, State& state, Scratch& scratch) {
+void iterate(const Template& t, const Pixels& p, const Frame& frame, double tolerance, int64_t budget, State& state,
+             Scratch& scratch) {
   state.error = INFINITE;
   for (int64_t k = 0; k < budget && state.error > tolerance; ++k) {
-    const Warp warp = warp_of(t, state.pose);
+    const Warp warp = warp_of(state.pose);
     cover<degree>(t, frame, warp, scratch.window, k == 0);
     double step[3];
-    if (increment<degree>(t, warp, scratch, step)) {
+    scratch.u = coefficients(t, p, look<degree>(t, p, warp, scratch), scratch, step);
+    if (std::isfinite(step[0]) && std::isfinite(step[1]) && std::isfinite(step[2])) {
       advance(t, step, state);
     } else {
       state.error = 0;
@@ -159,40 +168,21 @@ void iterate(const Template& t, const Frame& frame, double tolerance, int64_t bu
   }
 }
 
-// What the first iterations use of a template: its sparse pixels, gathered.
-struct Thin {
-  std::vector<float> px, py, level;
-  Template t;
-
-  // sparse (n), K (p, n) of torch_ecc.Reference
-  void gather(const Template& whole, const int64_t* sparse, int64_t n, const float* K) {
-    t = whole;
-    for (auto [to, from] : {std::pair{&px, whole.px}, {&py, whole.py}, {&level, whole.level}}) {
-      to->resize(n);
-      for (int64_t i = 0; i < n; ++i) (*to)[i] = from[sparse[i]];
-    }
-    t.n = n;
-    t.K = K;
-    t.px = px.data();
-    t.py = py.data();
-    t.level = level.data();
-  }
-};
-
 // solver.refine. False, with nothing settled, if the template comes so near the frame's border that pixels may drop out.
-inline bool refine(const Template& t, const Template& thin, const Frame& frame, const Settings& set, State& state, Scratch& scratch) {
+inline bool refine(const Template& t, const Frame& frame, const Settings& set, State& state, Scratch& scratch) {
   int64_t budget = set.max_iterations;
-  scratch.patch.resize(t.n);
+  scratch.patch.resize(t.whole.height * t.whole.pitch + LANES);
+  scratch.lines.resize((MOST + BLOCK) * t.whole.pitch);
   if (!inside(t, state.pose, frame, EDGE)) return false;
-  if (budget > 1 && (set.degree > 1 || thin.n < t.n)) {
+  if (budget > 1 && (set.degree > 1 || t.thin.step > 1)) {
     const int64_t coarse = std::max<int64_t>(budget * 2 / 3, 1);
-    iterate<1>(thin, frame, std::max(set.tolerance, COARSE_TOLERANCE), coarse, state, scratch);
+    iterate<1>(t, t.thin, frame, std::max(set.tolerance, COARSE_TOLERANCE), coarse, state, scratch);
     budget -= coarse;
     if (!inside(t, state.pose, frame, EDGE)) return false;
   }
-  if (set.degree == 1) iterate<1>(t, frame, set.tolerance, budget, state, scratch);
-  if (set.degree == 3) iterate<3>(t, frame, set.tolerance, budget, state, scratch);
-  if (set.degree == 5) iterate<5>(t, frame, set.tolerance, budget, state, scratch);
+  if (set.degree == 1) iterate<1>(t, t.whole, frame, set.tolerance, budget, state, scratch);
+  if (set.degree == 3) iterate<3>(t, t.whole, frame, set.tolerance, budget, state, scratch);
+  if (set.degree == 5) iterate<5>(t, t.whole, frame, set.tolerance, budget, state, scratch);
   return inside(t, state.pose, frame, 0);
 }
 

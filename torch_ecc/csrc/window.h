@@ -3,9 +3,29 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 namespace ecc {
+
+#ifdef __AVX512F__
+constexpr int LANES = 16;
+#else
+constexpr int LANES = 8;
+#endif
+typedef float Vector __attribute__((vector_size(4 * LANES)));
+typedef int16_t Shorts __attribute__((vector_size(2 * LANES)));
+
+template <class V, class T>
+V load(const T* from) {
+  V values;
+  std::memcpy(&values, from, sizeof values);
+  return values;
+}
+
+inline void store(const Vector& values, float* to) { std::memcpy(to, &values, sizeof values); }
+
+inline int64_t padded(int64_t n) { return (n + LANES - 1) / LANES * LANES; }
 
 struct Frame {  // rows of one grey frame where they are, in any of the three dtypes
   const void* data;
@@ -13,10 +33,10 @@ struct Frame {  // rows of one grey frame where they are, in any of the three dt
   enum { U8, U16, F32 } dtype;
 };
 
-struct Window {  // values at frame positions (x0 .. x0 + w - 1, y0 .. y0 + h - 1); rows are w + SPARE apart
-  static constexpr int64_t SPARE = 8;  // a row is read in whole vectors, at most so far beyond its end
+struct Window {  // values at frame positions (x0 .. x0 + w - 1, y0 .. y0 + h - 1)
+  static constexpr int64_t SPARE = 2 * LANES;  // a row is read in whole vectors, at most so far beyond its end
   int64_t x0 = 0, y0 = 0, w = 0, h = 0;
-  std::vector<float> values, raw, turned;
+  std::vector<float> values, raw, line;
   int64_t pitch() const { return w + SPARE; }
 };
 
@@ -32,9 +52,14 @@ inline int64_t within(int64_t i, int64_t n, bool mirrored) {
 template <class Pixel>
 void read_rows(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t h, int64_t pitch, bool mirrored,
                float* out) {
+  constexpr int64_t LINE = 64 / sizeof(Pixel), AHEAD = 16;  // a frame is new: its rows are fetched ahead of their use
   const int64_t first = std::clamp<int64_t>(-x0, 0, w), last = std::clamp<int64_t>(frame.w - x0, first, w);
+  const auto at = [&](int64_t j) {
+    return static_cast<const Pixel*>(frame.data) + within(y0 + j, frame.h, mirrored) * frame.stride;
+  };
   for (int64_t j = 0; j < h; ++j, out += pitch) {
-    const Pixel* row = static_cast<const Pixel*>(frame.data) + within(y0 + j, frame.h, mirrored) * frame.stride;
+    const Pixel* const row = at(j);
+    for (int64_t i = first; i < last + LINE; i += LINE) __builtin_prefetch(at(j + AHEAD) + x0 + std::min(i, last - 1));
     for (int64_t i = 0; i < first; ++i) out[i] = float(row[within(x0 + i, frame.w, mirrored)]);
     for (int64_t i = first; i < last; ++i) out[i] = float(row[x0 + i]);
     for (int64_t i = last; i < w; ++i) out[i] = float(row[within(x0 + i, frame.w, mirrored)]);
@@ -48,52 +73,71 @@ inline void read(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t 
   if (frame.dtype == Frame::F32) read_rows<float>(frame, x0, y0, w, h, pitch, mirrored, out);
 }
 
-constexpr int64_t VECTOR = 4;
-
-// out (w, h) = in (h, w) transposed, rows `to` and `from` apart, in tiles of columns. h counts up to the next VECTOR.
-inline void transpose(const float* __restrict in, int64_t h, int64_t w, int64_t from, float* __restrict out, int64_t to) {
-  constexpr int64_t TILE = 16;
-  for (int64_t i = 0; i < w; i += TILE)
-    for (int64_t j = 0; j < h; j += VECTOR)
-      for (int64_t a = i; a < std::min(i + TILE, w); ++a) {
-        const float *c = in + j * from + a;
-        const float b[4] = {c[0], c[from], c[2 * from], c[3 * from]};
-        std::copy(b, b + 4, out + a * to + j);
-      }
-}
-
-// Samples to coefficients of the interpolating B-spline, down the columns of (h, w): the recursions of Unser et al.
-// (1993, I) from both ends, started as if the border went on; that is forgotten 1e-6 after so many pixels as `start`.
+// Samples to coefficients of the interpolating B-spline, one pole z of the inverse filter after the other (Unser et
+// al., 1993, I). `start` px from a border it is forgotten but for 3e-5 of the contrast there.
 template <int degree>
 struct Prefilter {
-  static constexpr int start = degree == 3 ? 11 : 17;
+  static constexpr int poles = degree / 2, start = degree == 3 ? 8 : 18;
 
-  static void columns(float* values, int64_t h, int64_t w) {
+  static double pole(int p) {
     const double inner = std::sqrt(17745.0 / 4), outer = std::sqrt(105.0 / 4);
-    const double poles[2] = {degree == 3 ? std::sqrt(3.0) - 2 : std::sqrt(67.5 - inner) + outer - 6.5,
-                             std::sqrt(67.5 + inner) - outer - 6.5};
-    for (int p = 0; p < degree / 2; ++p) {
-      const float z = float(poles[p]), rest = 1 - z;
-      for (int64_t i = 0; i < w; ++i) values[i] *= rest;
-      for (int64_t j = 1; j < h; ++j) add(values + j * w, rest * rest, values + (j - 1) * w, z, w);
-      for (int64_t i = 0; i < w; ++i) values[(h - 1) * w + i] /= rest;
-      for (int64_t j = h - 2; j >= 0; --j) add(values + j * w, 1, values + (j + 1) * w, z, w);
+    if (degree == 3) return std::sqrt(3.0) - 2;
+    return p == 0 ? std::sqrt(67.5 - inner) + outer - 6.5 : std::sqrt(67.5 + inner) - outer - 6.5;
+  }
+
+  // Down the columns, recursively from both ends, started as if the border went on; `pitch` a multiple of 4 LANES.
+  static void columns(float* values, int64_t h, int64_t pitch) {
+    constexpr int SIDE = 4;  // vectors side by side: one alone would wait for itself
+    for (int p = 0; p < poles; ++p) {
+      const float z = float(pole(p)), rest = 1 - z, gain = rest * rest;
+      for (int64_t i = 0; i < pitch; i += SIDE * LANES) {
+        Vector last[SIDE];
+        const auto go = [&](int64_t j, float now, float before) {
+          for (int k = 0; k < SIDE; ++k) {
+            float* const at = values + j * pitch + i + k * LANES;
+            last[k] = now * load<Vector>(at) + before * last[k];
+            store(last[k], at);
+          }
+        };
+        for (int k = 0; k < SIDE; ++k) last[k] = load<Vector>(values + i + k * LANES) * rest;
+        for (int64_t j = 0; j < h; ++j) go(j, gain, z);
+        for (int k = 0; k < SIDE; ++k) last[k] = load<Vector>(values + (h - 1) * pitch + i + k * LANES) / rest;
+        for (int64_t j = h - 1; j >= 0; --j) go(j, 1, z);
+      }
     }
   }
 
-  static void add(float* __restrict row, float gain, const float* __restrict last, float z, int64_t w) {
-    for (int64_t i = 0; i < w; ++i) row[i] = gain * row[i] + z * last[i];
+  // Along a row of w + 2 start values, which it overwrites: 1 / ((1 - z S) (1 - z / S)), S a shift by one px, is the
+  // product over m = 1, 2, 4 ... of (1 + z^m S^m) (1 + z^m / S^m), so that each factor takes three values.
+  static void row(float* __restrict a, float* __restrict b, int64_t w, float* out) {
+    int64_t first = 0, last = w + 2 * start;
+    for (int p = 0; p < poles; ++p) {
+      const int reach = degree == 3 ? 4 : p == 0 ? 8 : 2;  // z^(2 reach) is left out
+      double power = pole(p);
+      const double whole = (1 - power) / (1 - std::pow(power, 2 * reach));
+      for (int m = 1; m <= reach; m *= 2, power *= power) {
+        const double gain = m == 1 ? whole * whole : 1;
+        const float middle = float(gain * (1 + power * power)), side = float(gain * power);
+        first += m;
+        last -= m;
+        const bool ready = p == poles - 1 && m == reach;
+        float* __restrict to = ready ? out - start : b;
+        if (ready) first = start, last = start + w;
+        for (int64_t i = first; i < last; ++i) to[i] = middle * a[i] + side * (a[i - m] + a[i + m]);
+        std::swap(a, b);
+      }
+    }
   }
 
   static void fill(const Frame& frame, Window& window) {
-    const int64_t wide = window.w + 2 * start, high = window.h + 2 * start, rows = window.h + VECTOR;
-    window.raw.resize(wide * (high + VECTOR));
-    window.turned.resize((wide + VECTOR) * rows);
-    read(frame, window.x0 - start, window.y0 - start, wide, high, wide, true, window.raw.data());
-    columns(window.raw.data(), high, wide);
-    transpose(window.raw.data() + start * wide, window.h, wide, wide, window.turned.data(), rows);
-    columns(window.turned.data(), wide, rows);
-    transpose(window.turned.data() + start * rows, window.w, window.h, rows, window.values.data(), window.pitch());
+    const int64_t wide = window.w + 2 * start, high = window.h + 2 * start;
+    const int64_t pitch = (wide + 4 * LANES - 1) / (4 * LANES) * (4 * LANES);
+    window.raw.resize(pitch * high);
+    window.line.resize(pitch);
+    read(frame, window.x0 - start, window.y0 - start, wide, high, pitch, true, window.raw.data());
+    columns(window.raw.data(), high, pitch);
+    for (int64_t j = 0; j < window.h; ++j)
+      row(window.raw.data() + (start + j) * pitch, window.line.data(), window.w, window.values.data() + j * window.pitch());
   }
 };
 
