@@ -62,6 +62,9 @@ inline Remains remains(const Template& t, Scratch& scratch) {
   const int16_t* rt = t.at<int16_t>(p.r.at[2]);
   const float* weight = t.at<float>(p.weight);
   float *const lines = scratch.lines.data(), *const rest = lines + MOST * p.pitch;
+  float* const starts = rest + BLOCK * p.pitch;  // 1 where a block of columns begins, 0 elsewhere
+  for (int64_t i = 0; i < p.pitch; ++i) starts[i] = 0;
+  for (int64_t i = 0; i < p.width; i += BLOCK) starts[i] = 1;
   Remains out;
   for (int64_t first = 0; first < p.height; first += BLOCK) {
     const int64_t rows = std::min(BLOCK, p.height - first);
@@ -70,8 +73,8 @@ inline Remains remains(const Template& t, Scratch& scratch) {
     Vector sums[4] = {};
     for (int64_t j = 0; j < rows; ++j)
       for (int64_t i = 0; i < p.pitch; i += LANES) {
-        const Vector w = load<Vector>(weight + (first + j) * p.weight_pitch + i), r = load<Vector>(rest + j * p.pitch + i);
-        const Vector v = load<Vector>(patch + j * p.pitch + i), wv = w * v;
+        const Vector w = load<Vector>(weight + (first + j) * p.weight_pitch + i);
+        const Vector v = counted(patch + j * p.pitch + i, w), r = counted(rest + j * p.pitch + i, w), wv = w * v;
         sums[0] += w * r * r;
         sums[1] += wv;
         sums[2] += wv * v;
@@ -82,13 +85,19 @@ inline Remains remains(const Template& t, Scratch& scratch) {
       for (int l = 0; l < LANES; ++l) *totals[k] += double(sums[k][l]) * (k == 3 ? p.r.grey : 1);
     products(t, p, first, rows, rest, lines);
     for (int k = 0; k < 3; ++k) {
-      std::fill(rest, rest + p.pitch, 0.f);
-      for (int64_t c = 0; c < p.columns; ++c)
-        for (int64_t i = 0; i < p.pitch; ++i) rest[i] += float(p.inverse[k][c]) * lines[c * p.pitch + i];
-      for (int64_t i = 0; i < p.width; i += BLOCK) {
-        const double sum = std::accumulate(rest + i, rest + std::min(i + BLOCK, p.width), 0.0);
-        out.clustered[k] += sum * sum;
+      for (int64_t i = 0; i < p.pitch; i += LANES) {
+        Vector sum{};
+        for (int64_t c = 0; c < p.columns; ++c) sum += float(p.inverse[k][c]) * load<Vector>(lines + c * p.pitch + i);
+        store(sum, rest + i);
       }
+      store(Vector{}, rest + p.pitch);
+      Vector squares{};
+      for (int64_t i = 0; i < p.pitch; i += LANES) {
+        Vector sum = load<Vector>(rest + i);
+        for (int64_t l = 1; l < BLOCK; ++l) sum += load<Vector>(rest + i + l);
+        squares += sum * sum * load<Vector>(starts + i);
+      }
+      for (int l = 0; l < LANES; ++l) out.clustered[k] += squares[l];
     }
   }
   return out;

@@ -75,17 +75,17 @@ void sample_runs(const Window& window, const Line& line, float* out) {
 // Any line, point by point.
 template <int degree>
 void sample_points(const Window& window, const Line& line, float* __restrict out) {
-  constexpr int taps = degree + 1, CHUNK = 64, size = degree == 1 ? 2 : degree == 3 ? 4 : 8;  // of a row's taps
+  constexpr int taps = degree + 1, CHUNK = 64, size = degree == 3 ? 4 : 8;  // of a vector that holds a row's taps
   typedef float Taps __attribute__((vector_size(4 * size)));
   constexpr float BELOW_ONE = 0.99999f;
   const float right = float(window.w - taps) + BELOW_ONE, bottom = float(window.h - taps) + BELOW_ONE;
   const int32_t pitch = int32_t(window.pitch());
   const float* const from = window.values.data();
-  alignas(64) float fx[CHUNK], fy[CHUNK], row[CHUNK * size], wx[taps][CHUNK], wy[taps][CHUNK];
+  alignas(64) float fx[CHUNK], fy[CHUNK], row[CHUNK * size], below[CHUNK * 2], wx[taps][CHUNK], wy[taps][CHUNK];
   int32_t place[CHUNK];
-  for (int first = 0; first < line.n; first += CHUNK) {
+  for (int first = 0; first < line.n; first += CHUNK, out += CHUNK) {
     const int n = std::min(line.n - first, CHUNK);
-    for (int i = 0; i < n; ++i) {
+    for (int i = 0; i < CHUNK; ++i) {
       const float x = std::clamp(line.x + float(first + i) * line.dx, 0.f, right);
       const float y = std::clamp(line.y + float(first + i) * line.dy, 0.f, bottom);
       const int32_t ix = int32_t(x), iy = int32_t(y);
@@ -93,13 +93,25 @@ void sample_points(const Window& window, const Line& line, float* __restrict out
       fy[i] = y - float(iy);
       place[i] = iy * pitch + ix;
     }
-    for (int i = 0; i < n; ++i) {
-      float x[taps], y[taps];
-      weigh<degree, float>(fx[i], x);
-      weigh<degree, float>(fy[i], y);
+    if constexpr (degree == 1) {
+      for (int i = 0; i < n; ++i) {
+        std::memcpy(row + 2 * i, from + place[i], 8);
+        std::memcpy(below + 2 * i, from + place[i] + pitch, 8);
+      }
+      for (int i = 0; i < n; ++i) {
+        const float a = row[2 * i] + fx[i] * (row[2 * i + 1] - row[2 * i]);
+        const float b = below[2 * i] + fx[i] * (below[2 * i + 1] - below[2 * i]);
+        out[i] = a + fy[i] * (b - a);
+      }
+      continue;
+    }
+    for (int i = 0; i < CHUNK; i += LANES) {
+      Vector x[taps], y[taps];
+      weigh<degree, Vector>(load<Vector>(fx + i), x);
+      weigh<degree, Vector>(load<Vector>(fy + i), y);
       for (int k = 0; k < taps; ++k) {
-        wx[k][i] = x[k];
-        wy[k][i] = y[k];
+        store(x[k], wx[k] + i);
+        store(y[k], wy[k] + i);
       }
     }
     for (int i = 0; i < n; ++i) {  // down the columns first, for all taps of a row at once
@@ -113,7 +125,7 @@ void sample_points(const Window& window, const Line& line, float* __restrict out
     for (int i = 0; i < n; ++i) {
       float sum = 0;
       for (int k = 0; k < taps; ++k) sum += wx[k][i] * row[i * size + k];
-      out[first + i] = sum;
+      out[i] = sum;
     }
   }
 }

@@ -172,7 +172,7 @@ void iterate(const Template& t, const Pixels& p, const Frame& frame, double tole
 inline bool refine(const Template& t, const Frame& frame, const Settings& set, State& state, Scratch& scratch) {
   int64_t budget = set.max_iterations;
   scratch.patch.resize(t.whole.height * t.whole.pitch + LANES);
-  scratch.lines.resize((MOST + BLOCK) * t.whole.pitch);
+  scratch.lines.resize((MOST + BLOCK + 1) * t.whole.pitch + LANES);
   if (!inside(t, state.pose, frame, EDGE)) return false;
   if (budget > 1 && (set.degree > 1 || t.thin.step > 1)) {
     const int64_t coarse = std::max<int64_t>(budget * 2 / 3, 1);

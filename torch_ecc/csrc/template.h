@@ -43,6 +43,16 @@ struct Template {  // the head of a block of bytes; images and weights lie behin
   int light() const { return criterion < 0 ? 0 : int(criterion); }
 };
 
+// Coordinates of the first pixels of a row.
+inline Vector row_of(const Pixels& p) {
+  Vector x;
+  for (int k = 0; k < LANES; ++k) x[k] = float(p.left + k * p.step);
+  return x;
+}
+
+// v where it has weight; elsewhere it may be anything, NaN too: whole vectors reach beyond what has been sampled.
+inline Vector counted(const float* v, const Vector& weight) { return weight > 0 ? load<Vector>(v) : Vector{}; }
+
 inline Vector wide(const int16_t* from) { return __builtin_convertvector(load<Shorts>(from), Vector); }
 
 // lines (5 + light, pitch) = sums over `rows` rows from `first` on of each column of Z times w v. v: (rows, pitch)
@@ -51,14 +61,14 @@ void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, c
   const int16_t *zx = t.at<int16_t>(p.z.at[0]), *zy = t.at<int16_t>(p.z.at[1]), *zt = t.at<int16_t>(p.z.at[2]);
   const float* weight = t.at<float>(p.weight);
   const float level = p.z.level / p.z.grey, step = float(p.step);
-  Vector x;
-  for (int k = 0; k < LANES; ++k) x[k] = float(p.left + k * p.step);
+  Vector x = row_of(p);
   for (int64_t i = 0; i < p.pitch; i += LANES, x += LANES * step) {
     Vector sum[5 + light] = {};
     for (int64_t j = 0; j < rows; ++j) {
       const int64_t at = (first + j) * p.pitch + i;
       const float y = float(p.top + double(first + j) * p.step);
-      const Vector wv = load<Vector>(v + j * p.pitch + i) * load<Vector>(weight + (first + j) * p.weight_pitch + i);
+      const Vector w = load<Vector>(weight + (first + j) * p.weight_pitch + i);
+      const Vector wv = w * counted(v + j * p.pitch + i, w);
       const Vector gx = wide(zx + at) * wv, gy = wide(zy + at) * wv, blurred = wide(zt + at), grey = blurred * wv;
       sum[0] += gx;
       sum[1] += gy;
@@ -110,9 +120,8 @@ inline void residual(const Template& t, int64_t first, int64_t rows, const Sums&
     const double y = p.top + double(first + j);
     const float in_x = float(u[0] + u[2] * y) * unit, in_y = float(u[1]) * unit, gain = float(u[3]);
     const float even = float(u[6] * y + u[8] * y * y), slope = float(u[5] + u[9] * y), bend = float(u[7]);
-    for (int64_t i = 0; i < p.pitch; i += LANES) {
-      Vector x;
-      for (int k = 0; k < LANES; ++k) x[k] = float(p.left) + float(i + k);
+    Vector x = row_of(p);
+    for (int64_t i = 0; i < p.pitch; i += LANES, x += float(LANES)) {
       const int64_t at = (first + j) * p.pitch + i;
       const Vector contrast = wide(rt + at) * grey, light = even + x * (slope + x * bend);
       const Vector motion = in_x * wide(rx + at) + (in_y - turn * x) * wide(ry + at);

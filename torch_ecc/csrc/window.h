@@ -74,10 +74,11 @@ inline void read(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t 
 }
 
 // Samples to coefficients of the interpolating B-spline, one pole z of the inverse filter after the other (Unser et
-// al., 1993, I). `start` px from a border it is forgotten but for 3e-5 of the contrast there.
+// al., 1993, I). `start` px from
+// a border it is forgotten.
 template <int degree>
 struct Prefilter {
-  static constexpr int poles = degree / 2, start = degree == 3 ? 8 : 18;
+  static constexpr int poles = degree / 2, start = degree == 3 ? 15 : 18;
 
   static double pole(int p) {
     const double inner = std::sqrt(17745.0 / 4), outer = std::sqrt(105.0 / 4);
@@ -109,35 +110,46 @@ struct Prefilter {
 
   // Along a row of w + 2 start values, which it overwrites: 1 / ((1 - z S) (1 - z / S)), S a shift by one px, is the
   // product over m = 1, 2, 4 ... of (1 + z^m S^m) (1 + z^m / S^m), so that each factor takes three values.
-  static void row(float* __restrict a, float* __restrict b, int64_t w, float* out) {
-    int64_t first = 0, last = w + 2 * start;
+  struct Factor {
+    int m;
+    float middle, side;
+  };
+
+  static std::vector<Factor> factors() {
+    std::vector<Factor> all;
     for (int p = 0; p < poles; ++p) {
-      const int reach = degree == 3 ? 4 : p == 0 ? 8 : 2;  // z^(2 reach) is left out
-      double power = pole(p);
-      const double whole = (1 - power) / (1 - std::pow(power, 2 * reach));
-      for (int m = 1; m <= reach; m *= 2, power *= power) {
-        const double gain = m == 1 ? whole * whole : 1;
-        const float middle = float(gain * (1 + power * power)), side = float(gain * power);
-        first += m;
-        last -= m;
-        const bool ready = p == poles - 1 && m == reach;
-        float* __restrict to = ready ? out - start : b;
-        if (ready) first = start, last = start + w;
-        for (int64_t i = first; i < last; ++i) to[i] = middle * a[i] + side * (a[i - m] + a[i + m]);
-        std::swap(a, b);
+      const int last = p == 0 ? 8 : 2;  // z^(2 last) is left out
+      double power = pole(p), gain = std::pow((1 - power) / (1 - std::pow(power, 2 * last)), 2);
+      for (int m = 1; m <= last; m *= 2, power *= power, gain = 1)
+        all.push_back({m, float(gain * (1 + power * power)), float(gain * power)});
+    }
+    return all;
+  }
+
+  static void row(const std::vector<Factor>& factors, float* a, float* b, int64_t w, float* out) {
+    int64_t first = 0, last = w + 2 * start;
+    for (const Factor& f : factors) {
+      first += f.m;
+      last -= f.m;
+      if (&f == &factors.back()) b = out - start, first = start, last = start + w;
+      for (int64_t i = first; i < last; i += LANES) {
+        const Vector sides = load<Vector>(a + i - f.m) + load<Vector>(a + i + f.m);
+        store(f.middle * load<Vector>(a + i) + f.side * sides, b + i);
       }
+      std::swap(a, b);
     }
   }
 
   static void fill(const Frame& frame, Window& window) {
     const int64_t wide = window.w + 2 * start, high = window.h + 2 * start;
-    const int64_t pitch = (wide + 4 * LANES - 1) / (4 * LANES) * (4 * LANES);
-    window.raw.resize(pitch * high);
-    window.line.resize(pitch);
+    const int64_t pitch = (wide + 5 * LANES) / (4 * LANES) * (4 * LANES);  // at least a vector is spare
+    window.raw.resize(pitch * high + 4 * LANES);
+    window.line.resize(pitch + 4 * LANES);  // rows are worked on in whole vectors, beyond their ends
     read(frame, window.x0 - start, window.y0 - start, wide, high, pitch, true, window.raw.data());
     columns(window.raw.data(), high, pitch);
+    static const std::vector<Factor> all = factors();
     for (int64_t j = 0; j < window.h; ++j)
-      row(window.raw.data() + (start + j) * pitch, window.line.data(), window.w, window.values.data() + j * window.pitch());
+      row(all, window.raw.data() + (start + j) * pitch, window.line.data(), window.w, window.values.data() + j * window.pitch());
   }
 };
 
