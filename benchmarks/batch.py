@@ -28,7 +28,7 @@ from torch_ecc.sim import Camera, Sequence
 
 YARDSTICK = "OpenCV ECC, fastest fair"
 MOTION = Harmonic(10.0, 2.0, 20)
-console = Console(width=110)
+console = Console(width=120)
 Follow = Callable[[Tensor], Tensor]
 
 
@@ -45,21 +45,41 @@ def batch(first: Tensor, centers: Tensor, **chosen: str) -> Follow:
     return lambda frame: tracker(frame).pose
 
 
+def iteration(frames: list[Tensor], sampler: str, chosen: dict[str, str]) -> float:
+    """Time in us of one more iteration of one template on all its pixels: from what many take longer than few."""
+    centers, least = [(320.0, 240.0)], {"tolerance": 1e-12, "prediction": "hold", "search": False}
+    short, long = (
+        Tracker(frames[0], centers, SIZE, interpolation=sampler, max_iterations=n, **least, **chosen) for n in (12, 144)
+    )
+    found = []
+    for frame in frames[1:]:
+        times, spent = [], []
+        for tracker in (short, long):
+            begun = time.perf_counter()
+            estimate = tracker(frame)
+            times.append(time.perf_counter() - begun)
+            spent.append(int(estimate.iterations[0]))
+        found.append(1e6 * (times[1] - times[0]) / (spent[1] - spent[0]))
+    return statistics.median(found)
+
+
 @click.command()
 @click.option("--count", default=64, show_default=True)
 @click.option("--threads", default=2, show_default=True)
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
 def main(count: int, threads: int, out: Path | None) -> None:
-    """Templates per second and errors, side by side."""
+    """Templates per second, time of one iteration of a template, and errors, side by side."""
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     sequence = Sequence(SCENE, MOTION.path(Camera()), Camera())
     frames, centers = list(sequence), spread(count, SIZE + 40, (480, 640)).round()
+    each: dict[str, float] = {}
     follow = {YARDSTICK: loop(frames[0], centers)}
     for backend, chosen in options().items():
         for sampler in ("bilinear", "bspline3"):
             title = ", ".join(filter(None, (f"torch_ecc {sampler}", backend)))
             follow[title] = batch(frames[0], centers, interpolation=sampler, **chosen)
+            each[title] = iteration(frames, sampler, chosen)
     taken: dict[str, list[float]] = {name: [] for name in follow}
     errors: dict[str, list[Tensor]] = {name: [] for name in follow}
     for frame, truth in zip(frames[1:], sequence.truth(centers)[1:], strict=True):
@@ -68,13 +88,17 @@ def main(count: int, threads: int, out: Path | None) -> None:
             pose = one(frame)
             taken[name].append(time.perf_counter() - begun)
             errors[name].append(pose - truth)
-    _show(f"{count} templates, {threads} threads", taken, errors, count, out)
+    _show(f"{count} templates, {threads} threads", taken, errors, each, out)
 
 
-def _show(title: str, taken: dict[str, list[float]], errors: dict[str, list[Tensor]], count: int, out: Path | None):
+Times = dict[str, list[float]]
+
+
+def _show(title: str, taken: Times, errors: dict[str, list[Tensor]], each: dict[str, float], out: Path | None) -> None:
     table = Table(title=title, title_justify="left")
-    for column in ("tracker", "templates per s", "over OpenCV's", "rms px", "rms deg", "lost"):
+    for column in ("tracker", "templates per s", "over OpenCV's", "us/iteration", "rms px", "rms deg", "lost"):
         table.add_column(column, justify="left" if column == "tracker" else "right")
+    count = len(next(iter(errors.values()))[0])
     rate = {name: count / statistics.median(values[1:]) for name, values in taken.items()}
     figures = []
     for name, parts in errors.items():
@@ -82,7 +106,14 @@ def _show(title: str, taken: dict[str, list[float]], errors: dict[str, list[Tens
         good = error[:, :2].abs().amax(1) < 0.5
         x, y, theta = error[good].square().mean(0).sqrt().tolist()
         ratio, lost = rate[name] / rate[YARDSTICK], f"{int((~good).sum())} of {len(good)}"
-        cells = (f"{rate[name]:,.0f}", f"{ratio:.1f}", f"{max(x, y):.5f}", f"{math.degrees(theta):.5f}", lost)
+        cells = (
+            f"{rate[name]:,.0f}",
+            f"{ratio:.1f}",
+            f"{each[name]:.1f}" if name in each else "",
+            f"{max(x, y):.5f}",
+            f"{math.degrees(theta):.5f}",
+            lost,
+        )
         table.add_row(name, *cells)
         mine = None if name == YARDSTICK else 0.5
         figures.append(Figure(f"{title} / {name} / over OpenCV's", ratio, "x", "higher", mine))

@@ -48,7 +48,8 @@ def as_image(where: str, name: str, image: object, device: torch.device | str | 
         raise ValueError(f"{where}: {name} must be uint8, uint16 or float, got {image.dtype}")
     if image.numel() == 0:
         raise ValueError(f"{where}: {name} must hold pixels, got the empty shape {shape}")
-    image = image[(None,) * (4 - image.dim())]
+    while image.dim() < 4:
+        image = image.unsqueeze(0)
     if image.shape[1] not in (1, 3, 4):
         hint = " (channels last? use permute(2, 0, 1))" if shape[-1] in (1, 3, 4) else ""
         raise ValueError(f"{where}: {name} must have 1, 3 or 4 channels, got {shape}{hint}")

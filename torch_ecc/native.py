@@ -14,12 +14,12 @@ import subprocess
 import sys
 import tempfile
 import warnings
+import weakref
 from functools import lru_cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from torch_ecc.criteria import ECC, ILLUMINATION, SSD, Criterion, PaperECC
 from torch_ecc.estimate import Estimate
@@ -30,7 +30,7 @@ SOURCES = Path(__file__).parent / "csrc"
 DEGREE = {"bilinear": 1, "bspline3": 3, "bspline5": 5}
 CODE: dict[type[Criterion], int] = {SSD: -1, PaperECC: -2}  # beside ECC's number of light columns
 DTYPES = (torch.uint8, torch.uint16, torch.float32)
-_packed = WeakTensorKeyDictionary()
+_packed: dict[int, tuple[weakref.ref[Tensor], Tensor]] = {}  # by the id of K
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.
 MATHS = ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"]
 INSTRUCTIONS = {
@@ -73,11 +73,14 @@ def track(
 
 def packed(reference: Reference) -> Tensor:
     """The templates (B, bytes) as the C++ reads them: 16-bit images, made once for as long as the reference lives."""
-    made = _packed.get(reference.K)
-    if made is None:
-        criterion = reference.criterion
-        code = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else CODE[type(criterion)]
-        made = _packed[reference.K] = torch.ops.torch_ecc.pack.default(list(reference[1:]), code)
+    key = id(reference.K)
+    known = _packed.get(key)
+    if known is not None and known[0]() is reference.K:
+        return known[1]
+    criterion = reference.criterion
+    code = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else CODE[type(criterion)]
+    made: Tensor = torch.ops.torch_ecc.pack.default(list(reference[1:]), code)
+    _packed[key] = weakref.ref(reference.K, lambda _: _packed.pop(key, None)), made
     return made
 
 

@@ -174,7 +174,7 @@ class Tracker(nn.Module):
 
     def _at_once(self, image: Tensor) -> Estimate | None:
         """Prediction, solve and update in one native call; None if that is not all that this frame needs."""
-        state = [self._buffers[name] for name in STATE]
+        state: list[Any] = [self._buffers[name] for name in STATE]  # a module's attributes are slow
         hold = self.prediction == "hold"
         step = native.track(self.references[0], image, state, self.settings, hold=hold, search=self.search)
         if step is None:
