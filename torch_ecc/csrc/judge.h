@@ -69,6 +69,7 @@ inline Remains remains(const Template& t, Scratch& scratch) {
   for (int64_t first = 0; first < p.height; first += BLOCK) {
     const int64_t rows = std::min(BLOCK, p.height - first);
     const float* const patch = scratch.patch.data() + first * p.pitch;
+    fetch(t, p, p.r, first + BLOCK);
     residual(t, first, rows, scratch.u, patch, rest);
     Vector sums[4] = {};
     for (int64_t j = 0; j < rows; ++j)

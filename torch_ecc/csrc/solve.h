@@ -84,6 +84,7 @@ Sums look(const Template& t, const Pixels& p, const Warp& warp, Scratch& scratch
   for (int64_t first = 0; first < p.height; first += BLOCK) {
     const int64_t rows = std::min(BLOCK, p.height - first);
     float* const band = scratch.patch.data() + first * p.pitch;
+    fetch(t, p, p.z, first);
     for (int64_t j = 0; j < rows; ++j) {
       const double y = p.top + double(first + j) * p.step;
       sample<degree>(window,

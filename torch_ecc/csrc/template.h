@@ -55,6 +55,13 @@ inline Vector counted(const float* v, const Vector& weight) { return weight > 0 
 
 inline Vector wide(const int16_t* from) { return __builtin_convertvector(load<Shorts>(from), Vector); }
 
+// Asks for a row of blocks from memory ahead of its use: too many rows at once for the processor to guess them.
+inline void fetch(const Template& t, const Pixels& p, const Images& images, int64_t first) {
+  const int64_t begin = 2 * first * p.pitch, end = 2 * std::min(first + BLOCK, p.height) * p.pitch;
+  for (int64_t offset : images.at)
+    for (int64_t at = begin; at < end; at += 64) __builtin_prefetch(t.at<char>(offset + at));
+}
+
 // lines (5 + light, pitch) = sums over `rows` rows from `first` on of each column of Z times w v. v: (rows, pitch)
 template <int light>
 void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, float* lines) {
