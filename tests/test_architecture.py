@@ -19,6 +19,7 @@ LAYERS = [
     {"pose"},
     {"frame", "sampling", "estimate", "calibration", "comparison", "config", "curves"},
     {"criteria", "synchrony"},
+    {"noise"},
     {"reference"},
     {"solver", "pyramid"},
     {"judge", "bank", "native"},

@@ -49,19 +49,31 @@ def align(
 
 
 def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
-    """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype."""
-    if not native.serves(reference, image, settings):
-        return solve_in_torch(reference, image, pose, settings)
-    estimate, left = native.solve(reference, image, pose, settings)
+    """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype.
+
+    Templates at the frame's border, where pixels drop out of sight, are few and take a slower way.
+    """
+    if native.serves(reference, image, settings):
+        estimate, left = native.solve(reference, image, pose, settings)
+    else:
+        estimate = solve_in_torch(reference, image, pose, settings)
+        left = bool((estimate.status < 0).any())
     if not left:
         return estimate
     rest = (estimate.status < 0).nonzero()[:, 0]
     part = image if len(image) == 1 else image.float()[rest]  # torch 2.4 cannot index uint16
-    settled = solve_in_torch(reference.select(rest), part, pose[rest], settings)
+    settled = solve_in_torch(reference.select(rest), part, pose[rest], settings, border=True)
     return Estimate(*(e.index_copy(0, rest, s) for e, s in zip(estimate, settled, strict=True)))
 
 
-def solve_in_torch(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
-    """``solve`` on any device, with any criterion: what the native path is measured against."""
-    state = refine(reference, image.float(), State.start(reference, pose), settings)
-    return judge(reference, (image.shape[-2], image.shape[-1]), state, pose, settings)
+def solve_in_torch(
+    reference: Reference, image: Tensor, pose: Tensor, settings: Settings, *, border: bool = False
+) -> Estimate:
+    """``solve`` on any device, with any criterion: what the native path is measured against.
+
+    Without ``border`` templates that come near it are not settled: status -1. No device but the CPU is then stopped
+    for the host to look at a value, so that a CUDA graph can hold all of it.
+    """
+    state, settled = refine(reference, image.float(), State.start(reference, pose), settings, border=border)
+    estimate = judge(reference, state, pose, settings, (image.shape[-2], image.shape[-1]) if border else None)
+    return estimate if border else estimate._replace(status=torch.where(settled, estimate.status, -1).to(torch.int8))

@@ -13,9 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torch_ecc.noise import INSTRUMENT_BLUR
 from torch_ecc.pose import compose, rotation
 from torch_ecc.pyramid import as_images
-from torch_ecc.reference import INSTRUMENT_BLUR, Reference
+from torch_ecc.reference import Reference
 from torch_ecc.sampling import Bilinear, BSpline, inside, prefilter
 
 SMALLEST_SEARCHED = 24  # px: root of the area that a template keeps at the level at which it is searched for

@@ -127,6 +127,20 @@ def centred(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return rest, (rest * rest * weight).sum(-1).sqrt()
 
 
+def safe_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse (B, n, n), zero where ``matrix`` is singular to float32, and whether it is regular, (B,) bool.
+
+    Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude.
+    """
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    scale = diagonal.abs().clamp(min=1e-30).rsqrt()
+    unit = matrix * scale[:, :, None] * scale[:, None, :]
+    inverse, _ = torch.linalg.inv_ex(unit)
+    regular = (inverse.abs().sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
+    inverse = torch.where(regular[:, None, None], inverse, 0.0)
+    return inverse * scale[:, :, None] * scale[:, None, :], regular
+
+
 def make_criterion(criterion: str | Criterion, illumination: str = "linear") -> Criterion:
     """The criterion of a name ("ecc", "ecc_paper" or "ssd"), or the object itself."""
     if not isinstance(criterion, str):

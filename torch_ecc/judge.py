@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_ecc.criteria import centred
+from torch_ecc.criteria import centred, safe_inverse
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.pose import rotation
-from torch_ecc.reference import ALIASING, Reference, reweigh, safe_inverse
-from torch_ecc.sampling import NOISE_GAIN, inside
+from torch_ecc.reference import ALIASING, Reference, reweigh
+from torch_ecc.sampling import NOISE_GAIN, host_looks, inside
 from torch_ecc.solver import Settings, State, warps
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
@@ -18,17 +18,21 @@ FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whe
 DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
 
 
-def judge(reference: Reference, size: tuple[int, int], state: State, start: Tensor, settings: Settings) -> Estimate:
-    """The record of B solved templates in a frame of ``size`` (h, w); failed ones get their ``start`` (B, 3) back."""
-    pose, whole = state.pose, reference
-    warp, visible = warps(reference, pose), torch.ones_like(pose[:, 0])
-    if not bool(inside(warp, reference.box, size).all()):
-        reference = reweigh(reference, inside(warp, reference.pixels, size))
-        visible = (reference.weight.sum(-1) / whole.weight.sum(-1)).to(pose.dtype)
+def judge(
+    reference: Reference, state: State, start: Tensor, settings: Settings, size: tuple[int, int] | None = None
+) -> Estimate:
+    """The record of B solved templates; failed ones get their ``start`` (B, 3) back.
+
+    ``size`` (h, w) of the frame: only pixels inside it count. None if all are known to be.
+    """
+    pose, whole, visible = state.pose, reference, torch.ones_like(state.error)
+    if size is not None:
+        reference = reweigh(reference, inside(warps(reference, pose), reference.pixels, size))
+        visible = reference.moments[:, 1] / whole.moments[:, 1]
     residual, gain = reference.criterion.fit(reference, state.patch)
-    gain = gain.to(pose.dtype)
-    power = (reference.weight * residual * residual).sum(-1) / reference.weight.sum(-1).clamp(min=1e-30)
-    power, gain = power.to(pose.dtype).nan_to_num(0.0, 0.0, 0.0), gain.nan_to_num(0.0, 0.0, 0.0)
+    gain = gain.to(pose.dtype).nan_to_num(0.0, 0.0, 0.0)
+    power = (reference.weight * residual * residual).sum(-1) / reference.moments[:, 1].clamp(min=1e-30)
+    power = power.nan_to_num(0.0, 0.0, 0.0)
     score = correlation(reference.signal[:, 3], state.patch, reference.weight).to(pose.dtype)
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
     structure = clustering(reference, residual, noise * (1 + gain * gain))
@@ -36,7 +40,8 @@ def judge(reference: Reference, size: tuple[int, int], state: State, start: Tens
     covariance, fixed = pose_covariance(reference, noise, gain, pose, structure, sampler)
     shown = visible >= settings.min_visible
     alike = score
-    if bool((score < settings.min_score).any()):  # light alone must not make a stranger of the template
+    if not host_looks(score.device) or bool((score < settings.min_score).any()):
+        # Light alone must not make a stranger of the template.
         alike = torch.maximum(score, flat_correlation(reference, state.patch).to(pose.dtype))
     match = (alike >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
     status = decide(whole, shown, match, fixed, state.error <= settings.tolerance)
@@ -54,10 +59,8 @@ def decide(reference: Reference, shown: Tensor, match: Tensor, fixed: Tensor, co
     status = torch.where(fixed, status, int(Status.LOW_TEXTURE))
     status = torch.where(match, status, int(Status.LOST))
     status = torch.where(shown, status, int(Status.OUT_OF_VIEW))
-    failed = ~(match & shown)
-    if bool(failed.any()):  # a template without texture of its own is why
-        empty = reference.noise.square() * reference.noise_share > DOUBTFUL_SHARE
-        status = torch.where(failed & empty, int(Status.LOW_TEXTURE), status)
+    empty = reference.noise.square() * reference.noise_share > DOUBTFUL_SHARE
+    status = torch.where(empty & ~(match & shown), int(Status.LOW_TEXTURE), status)  # without texture: that is why
     return status.to(torch.int8)
 
 
@@ -84,7 +87,7 @@ def flat_correlation(reference: Reference, g: Tensor) -> Tensor:
 def noise_variance(reference: Reference, power: Tensor, gain: Tensor, sampled: float) -> Tensor:
     """Variance (B,) of the noise of one image, from the residuals' mean square ``power`` (B,) = the template's share
     gain^2 v plus the frame's, of which its sampling left ``sampled`` v; freed of the fitted columns' part."""
-    count, columns = (reference.weight > 0).sum(-1), reference.K.shape[1]
+    count, columns = reference.moments[:, 0], reference.K.shape[1]
     return power * count / (count - columns).clamp(min=1) / (gain * gain + sampled)
 
 

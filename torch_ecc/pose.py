@@ -16,13 +16,16 @@ Conventions of the whole package, written here once:
 from __future__ import annotations
 
 from math import tau
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
     from kornia.geometry.liegroup import Se2
+
+Array = TypeVar("Array", Tensor, "np.ndarray[Any, Any]")
 
 
 def pose_dtype(device: torch.device | str) -> torch.dtype:
@@ -30,10 +33,22 @@ def pose_dtype(device: torch.device | str) -> torch.dtype:
     return torch.float32 if torch.device(device).type == "mps" else torch.float64
 
 
-def rotation(theta: Tensor) -> Tensor:
+def library(array: Any) -> Any:
+    """torch or numpy, whichever ``array`` is of: what they have in common serves ``rotation`` and ``retract``."""
+    return torch if isinstance(array, Tensor) else np
+
+
+def alike(tensor: Tensor, array: Any) -> Any:
+    """``tensor`` in the library and the dtype of ``array``."""
+    return tensor.to(array.dtype) if isinstance(array, Tensor) else tensor.numpy()
+
+
+def rotation(theta: Array) -> Array:
     """Rotation block of eq. (2): (...) -> (..., 2, 2)."""
-    c, s = theta.cos(), theta.sin()
-    return torch.stack((c, s, -s, c), -1).reshape(*theta.shape, 2, 2)
+    xp, angle = library(theta), theta[..., None]
+    c, s = xp.cos(angle), xp.sin(angle)
+    turn: Array = xp.concatenate((c, s, -s, c), -1).reshape(*theta.shape, 2, 2)
+    return turn
 
 
 def matrix(pose: Tensor) -> Tensor:
@@ -69,10 +84,12 @@ def inverse(pose: Tensor) -> Tensor:
     return torch.cat((t, -pose[..., 2:]), -1)
 
 
-def retract(pose: Tensor, increment: Tensor) -> Tensor:
+def retract(pose: Array, increment: Array) -> Array:
     """W(p) o W(dp)^-1, the inverse compositional update (eq. 10) in closed form: (B, 3), (B, 3) -> (B, 3)."""
     theta = pose[..., 2:] - increment[..., 2:]
-    return torch.cat((pose[..., :2] - (rotation(theta[..., 0]) @ increment[..., :2, None])[..., 0], theta), -1)
+    t = pose[..., :2] - (rotation(theta[..., 0]) @ increment[..., :2, None])[..., 0]
+    moved: Array = library(pose).concatenate((t, theta), -1)
+    return moved
 
 
 def unwrap(theta: Tensor, reference: Tensor) -> Tensor:

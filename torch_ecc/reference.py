@@ -17,27 +17,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_ecc.criteria import Criterion, centred, make_criterion
+from torch_ecc.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.frame import as_gray, as_mask, require_tensor
+from torch_ecc.noise import INSTRUMENT_BLUR, largest_share, noise_response, noise_slope, template_noise, texture_share
 from torch_ecc.pose import pose_dtype
-from torch_ecc.sampling import aliasing, blur, gradients, noise_level, pad
+from torch_ecc.sampling import aliasing, blur, gradients, pad
 
-INSTRUMENT_BLUR = 0.9  # px; 0.7 to 1 serve alike
-NEARBY = 4.0  # px: Gaussian window in which the texture of a template is told from its noise
-CERTAIN = 1.3  # times the noise's power in that window: by chance alone it is not more
 ALIASING = ("bilinear", "bspline3")  # samplers whose own error counts; that of bspline5 does not
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
-LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
 ENOUGH = 3000  # pixels of a template tell well where to go; the first iterations leave out others in x and y
 SPARSEST = 4  # px between those that are kept
 BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
 SMALLEST = 5  # px: side of the smallest template
+PIXELWISE = ("pixels", "signal", "instrument", "trust", "weight")  # beside K; what the sparse pixels have too
+SHARED = ("criterion", "pixels", "box", "block", "block_sizes", "sparse", "pixels_sparse")  # by all templates
 
 
 class Reference(NamedTuple):
@@ -55,7 +53,9 @@ class Reference(NamedTuple):
     columns, ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each;
     ``noise_share`` (B,) is the largest part of ``slope`` that such noise can be, in any direction.
 
-    For the first iterations: ``sparse`` (n,), pixels on a coarser grid; ``K_sparse`` (B, p, n), made from them alone.
+    For the first iterations: ``sparse`` (n,), pixels on a coarser grid; ``K_sparse`` (B, p, n), made from them alone,
+    and what else ``PIXELWISE`` names, there. ``moments`` (B, 4): how many pixels count, the sum of their weights, their
+    weighted mean and the weighted norm of what is left of them.
     """
 
     criterion: Criterion
@@ -79,6 +79,12 @@ class Reference(NamedTuple):
     noise_share: Tensor
     sparse: Tensor
     K_sparse: Tensor
+    pixels_sparse: Tensor
+    signal_sparse: Tensor
+    instrument_sparse: Tensor
+    trust_sparse: Tensor
+    weight_sparse: Tensor
+    moments: Tensor
 
     @property
     def lever(self) -> Tensor:
@@ -97,17 +103,13 @@ class Reference(NamedTuple):
         """The same templates on their ``sparse`` pixels: all that it takes to come near."""
         if len(self.sparse) == self.K.shape[-1]:
             return self
-        pixelwise = ("pixels", "block", "signal", "instrument", "trust", "weight")
-        some = {name: getattr(self, name)[..., self.sparse] for name in pixelwise}
-        return self._replace(**some, sparse=torch.arange(len(self.sparse), device=self.K.device), K=self.K_sparse)
+        return self._replace(**{name: getattr(self, f"{name}_sparse") for name in ("K", *PIXELWISE)})
 
     def select(self, index: Tensor) -> Reference:
         """The reference of the templates at ``index`` (n,)."""
         if len(index) == len(self.K):
             return self
-        shared = {"criterion", "pixels", "box", "block", "block_sizes", "sparse"} | (
-            {"weight"} if len(self.weight) == 1 else set()
-        )
+        shared = SHARED if len(self.weight) > 1 else (*SHARED, "weight", "weight_sparse")
         return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
@@ -161,13 +163,6 @@ def _refuse_flat(gray: Tensor, kept: Tensor) -> None:
         raise ValueError(f"prepare: template must have texture, got one single grey level in template {flat}")
 
 
-def template_noise(gray: Tensor, kept: Tensor) -> Tensor:
-    """Upper estimate (B,) of the noise of templates (B, 1, h, w), grey levels, where ``kept`` > 0."""
-    weight = kept.flatten(1)
-    contrast = centred(gray.flatten(1), weight)[1] / weight.sum(-1).sqrt()
-    return torch.maximum(noise_level(gray, kept), LEAST_NOISE * contrast)
-
-
 def _assemble(criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor, centre: Tensor) -> Reference:
     """Reference from ``images`` (B, 7, h, w): d/dx, d/dy and t, the same blurred, and what of the blurred slopes is
     texture; the template's ``noise`` (B,) and weights (1 or B, 1, h, w)."""
@@ -203,9 +198,10 @@ def _assemble(criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor,
     column, row = (pixels[:2] - box[:2, :1]).long()
     step = min(max(math.isqrt(pixels.shape[1] // ENOUGH), 1), SPARSEST)
     sparse = ((column % step == 0) & (row % step == 0)).nonzero()[:, 0]
-    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, signal[:, :, sparse])
+    few = [v[..., sparse] for v in (signal, pixels, signal, instrument, trust[:, 0], weight)]
+    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, *few, nothing[:, 0])
     reference = Reference(criterion, *constants, *rest)
-    thin = reweigh(reference.thin, weight[:, sparse] > 0)
+    thin = reweigh(reference.thin, few[-1] > 0)
     return reweigh(reference._replace(K_sparse=thin.K), weight > 0)
 
 
@@ -215,81 +211,32 @@ def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:
     return torch.stack((gx, gy, gx * local[:, 1] - gy * local[:, 0], t), 1)
 
 
-def texture_share(gradient: Tensor, noise: Tensor) -> Tensor:
-    """How much of the blurred ``gradient`` (B, 2, h, w) is texture, not ``noise`` (B,), near each pixel: (B, 1, h, w).
-
-    The factor S / (S + N / 2) that makes the scatter of two equally noisy images least, from the gradient's power
-    nearby. Where a template is flat its gradient is all noise, which as an instrument would only add scatter.
-    """
-    floor = 2 * noise_response()[1] * noise.to(gradient.dtype).square()[:, None, None, None]
-    power = (blur(gradient.square().sum(1, keepdim=True), NEARBY) - CERTAIN * floor).clamp(min=0)
-    return power / (power + floor / 2).clamp(min=1e-30)
-
-
 def reweigh(reference: Reference, seen: Tensor) -> Reference:
     """The reference of which only the pixels ``seen`` (1 or B, N), bool, count: new weight, K and covariance terms."""
     weight = reference.weight * seen
     uv = reference.uv
     R, Z = (reference.criterion.columns(v, uv) for v in (reference.signal, reference.instrument))
     ZW = Z * weight[:, None]
-    dtype = reference.radius.dtype
+    t, dtype = reference.signal[:, 3], reference.radius.dtype
+    total = weight.sum(-1, keepdim=True)
+    level = (t * weight).sum(-1, keepdim=True) / total.clamp(min=1e-30)
+    count, spread = (weight > 0).sum(-1, keepdim=True), (weight * (t - level) ** 2).sum(-1, keepdim=True).sqrt()
+    moments = torch.cat([v.expand_as(level).to(dtype) for v in (count, total, level, spread)], 1)
     normal, power = (ZW @ R.mT).to(dtype), (ZW @ ZW.mT).to(dtype)
     inverse, regular = safe_inverse(normal)
     others, _ = safe_inverse(normal[:, 3:, 3:])
     project = torch.eye(3, dtype=dtype, device=weight.device).expand(len(R), 3, 3)
     project = torch.cat((project, -normal[:, :3, 3:] @ others), -1)
     slope = (project @ normal)[:, :, :3] * regular[:, None, None]
-    inflation = _noise_slope(reference, weight * reference.trust) * noise_response()[0]
+    local = reference.pixels[:2] - reference.centre[:, :, None]
+    inflation = noise_slope(local, weight * reference.trust).to(dtype) * noise_response()[0]
     return reference._replace(
         weight=weight,
         K=(inverse @ ZW.to(dtype)).to(R.dtype),
         slope=slope,
         spread=project @ power @ project.mT,
         inflation=inflation,
-        spread_noise=_noise_slope(reference, (weight * reference.trust).square()) * noise_response()[1],
-        noise_share=_largest_share(slope, inflation),
+        spread_noise=noise_slope(local, (weight * reference.trust).square()).to(dtype) * noise_response()[1],
+        noise_share=largest_share(slope, inflation),
+        moments=moments,
     )
-
-
-def _largest_share(slope: Tensor, inflation: Tensor) -> Tensor:
-    """Largest eigenvalue of slope^-1 inflation, (B,), infinite where the slope is singular.
-
-    By a high power of the matrix, to 7 % from above, which an eigenvalue solver would not do without synchronising.
-    """
-    inverse, regular = safe_inverse(slope)
-    share = inverse @ inflation
-    scale = share.abs().amax((-2, -1), keepdim=True).clamp(min=1e-30)
-    power = torch.linalg.matrix_power(share / scale, 16).diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.where(regular & (power > 0), power.clamp(min=0) ** (1 / 16) * scale[:, 0, 0], torch.inf)
-
-
-def safe_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse (B, n, n), zero where ``matrix`` is singular to float32, and whether it is regular, (B,) bool.
-
-    Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude.
-    """
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    scale = diagonal.abs().clamp(min=1e-30).rsqrt()
-    unit = matrix * scale[:, :, None] * scale[:, None, :]
-    inverse, _ = torch.linalg.inv_ex(unit)
-    regular = (inverse.abs().sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
-    inverse = torch.where(regular[:, None, None], inverse, 0.0)
-    return inverse * scale[:, :, None] * scale[:, None, :], regular
-
-
-def _noise_slope(reference: Reference, weight: Tensor) -> Tensor:
-    """Sum over the pixels of w (dW/dp)^T dW/dp, (B, 3, 3): the shape of Z W G^T when the gradients are white noise."""
-    x, y = (reference.pixels[:2] - reference.centre[:, :, None]).unbind(1)
-    moments = (weight.expand_as(x), weight * x, weight * y, weight * (x * x + y * y))
-    n, wx, wy, wr = (moment.sum(-1).to(reference.radius.dtype) for moment in moments)
-    zero = torch.zeros_like(n)
-    return torch.stack((n, zero, wy, zero, n, -wx, wy, -wx, wr), -1).reshape(-1, 3, 3)
-
-
-@lru_cache(maxsize=1)
-def noise_response() -> tuple[float, float]:
-    """Of the x derivative of white noise of unit variance: raw times blurred, and blurred squared, on average."""
-    impulse = torch.zeros(1, 1, 33, 33)
-    impulse[..., 16, 16] = 1.0
-    raw, blurred = gradients(impulse)[:, 0], gradients(blur(impulse, INSTRUMENT_BLUR))[:, 0]
-    return float((raw * blurred).sum()), float((blurred * blurred).sum())

@@ -33,8 +33,7 @@ class Bilinear(NamedTuple):
     def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
         """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside the image its border repeats."""
         scale, shift = _unit_square(*self.image.shape[-2:], warp.dtype, warp.device)
-        unit = torch.cat((warp[:, :, :2] * scale, warp[:, :, 2:] * scale + shift), -1)
-        return _lookup(self.image, unit.to(self.image.dtype) @ pixels)
+        return _lookup(self.image, torch.addcmul(shift, warp, scale).to(pixels.dtype) @ pixels)
 
     def select(self, index: Tensor) -> Bilinear:
         """The sampler of some of the templates."""
@@ -64,7 +63,7 @@ class BSpline(NamedTuple):
         floor = points.floor()
         pairs = []  # per pair of taps: total weight and normalised coordinate of their lookup, both (B, 2, N)
         for first, total, second in _pairs(points - floor, self.degree):
-            pairs.append((total, (floor + (second / total + first)).mul_(scale).add_(shift)))
+            pairs.append((total, (floor + (second / total + first)).mul_(scale).add_(shift[:, 2:])))
         values = torch.zeros_like(points[:, 0])
         for wx, x in pairs:
             for wy, y in pairs:
@@ -83,15 +82,25 @@ class BSpline(NamedTuple):
 Sampler = Bilinear | BSpline
 
 
+def host_looks(device: torch.device) -> bool:
+    """Whether the host may look at values in the midst of a solve: that costs a CPU nothing and stops an accelerator.
+
+    It decides nothing but what is left undone: iterations after convergence, pixels of the frame far from a template.
+    """
+    return device.type == "cpu"
+
+
 def make_sampler(interpolation: str, image: Tensor, warp: Tensor, box: Tensor) -> Sampler:
     """The sampler of ``image`` (I, 1, H, W) around the patches ``warp`` (B, 2, 3) of the template rectangle.
 
     ``box`` (3, 4): the rectangle's corners. A B-spline is prefiltered only in the neighbourhood of the patches, unless
-    so many share one image that filtering all of it is less work. One host synchronisation on an accelerator.
+    so many share one image that filtering all of it is less work; on an accelerator always all of it.
     """
     if interpolation == "bilinear":
         return Bilinear(image)
     degree = int(interpolation[-1])
+    if not host_looks(image.device):
+        return BSpline(prefilter(image, degree), warp.new_zeros(1, 2), degree)
     h, w = image.shape[-2:]
     corners = warp @ box.to(warp.dtype)
     low = corners.amin(-1).floor() - REACH
@@ -125,9 +134,10 @@ def _mirror(index: Tensor, size: int) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-def _unit_square(h: int, w: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
-    """Scale (2, 1) and shift from px to grid_sample's coordinates: the outer pixel centres lie at -1 and 1."""
-    return torch.tensor([[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]], dtype=dtype, device=device), -1.0
+def _unit_square(h: int, w: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Scale (2, 1) and shift (2, 3) of warps from px to grid_sample's coordinates: -1 and 1 at the outer pixels."""
+    scale = torch.tensor([[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]], dtype=dtype, device=device)
+    return scale, torch.tensor([[0, 0, -1.0]] * 2, dtype=dtype, device=device)
 
 
 def _lookup(image: Tensor, points: Tensor, beyond: str = "border") -> Tensor:

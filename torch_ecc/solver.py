@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ecc.pose import retract, rotation
+from torch_ecc.pose import Array, alike, library, retract, rotation
 from torch_ecc.reference import Reference, reweigh
-from torch_ecc.sampling import Sampler, inside, make_sampler
+from torch_ecc.sampling import Sampler, host_looks, inside, make_sampler
 
 COARSE_TOLERANCE = 0.02  # px; the bilinear iterations only have to come near: their own bias is some 0.005 px
 EDGE = 4  # px: a template nearer than this to the frame's border may cross it while iterating
@@ -54,13 +55,13 @@ class Settings:
 class State(NamedTuple):
     """Of B templates: ``pose`` (B, 3), the last increment ``delta`` (B, 3) in px at the farthest pixel and the
     ``factor`` (B,) that it was stretched by, the predicted remaining ``error`` (B,) in px there, ``iterations`` (B,)
-    and the last sampled ``patch`` (B, N)."""
+    and the last sampled ``patch`` (B, N). All but the patch are tensors or, while iterating on a CPU, numpy arrays."""
 
-    pose: Tensor
-    delta: Tensor
-    factor: Tensor
-    error: Tensor
-    iterations: Tensor
+    pose: Any
+    delta: Any
+    factor: Any
+    error: Any
+    iterations: Any
     patch: Tensor
 
     @staticmethod
@@ -80,89 +81,121 @@ class State(NamedTuple):
         return State(*(v.index_copy(0, index, p) for v, p in zip(self, part, strict=True)))
 
 
-def warps(reference: Reference, pose: Tensor) -> Tensor:
+def warps(reference: Reference, pose: Array) -> Array:
     """2x3 warps (B, 2, 3) that take ``reference.pixels`` to the frame: eq. (2) about the template's own centre."""
     turn = rotation(pose[:, 2])
-    shift = pose[:, :2, None] - turn @ reference.centre[:, :, None].to(turn.dtype)
-    return torch.cat((turn, shift), -1)
+    shift = pose[:, :2, None] - turn @ alike(reference.centre, pose)[:, :, None]
+    warp: Array = library(pose).concatenate((turn, shift), -1)
+    return warp
 
 
 def gauss_newton(reference: Reference, sample: Sampler, state: State, tolerance: float) -> State:
     """One iteration. Elements whose predicted error is below ``tolerance`` already stay as they are."""
-    pose = state.pose
-    warp = warps(reference, pose)
-    g = sample(warp, reference.pixels)  # I(W(p_k; x'))
+    xp, pose, busy = library(state.pose), state.pose, state.error > tolerance
+    warp = torch.as_tensor(warps(reference, pose))
+    g = look(sample, warp, reference.pixels, state.patch, busy)  # I(W(p_k; x'))
     seen = reference if sample.edge is None else reweigh(reference, inside(warp, reference.pixels, sample.edge))
-    increment = seen.criterion.step(seen, g).to(pose.dtype)  # eq. (9), or a better one
-    delta = increment * reference.lever
-    length = torch.linalg.vector_norm(delta, dim=-1)
-    moving = length.isfinite() & (state.error > tolerance)
+    increment = alike(seen.criterion.step(seen, g), pose)  # eq. (9), or a better one
+    radius = alike(reference.radius, pose)
+    delta = increment * xp.stack((xp.ones_like(radius), xp.ones_like(radius), radius), -1)
+    length = norm(delta)
+    moving = (length < xp.inf) & busy  # NaN compares as not moving
     factor, rate = secant(state, delta, length)
-    stretch = torch.minimum(factor, LONGEST_STEP * reference.radius / length.clamp(min=1e-12))
+    stretch = xp.minimum(factor, LONGEST_STEP * radius / length)
     moved = retract(pose, increment * stretch[:, None])  # eq. (10)
     return State(
-        torch.where(moving[:, None], moved, pose),
-        torch.where(moving[:, None], delta, state.delta),
-        torch.where(moving, stretch, state.factor),
-        torch.where(moving, length * stretch * rate / (1 - rate), 0.0),
+        xp.where(moving[:, None], moved, pose),
+        xp.where(moving[:, None], delta, state.delta),
+        xp.where(moving, stretch, state.factor),
+        xp.where(moving, length * stretch * rate / (1 - rate), 0.0),
         state.iterations + moving,
         g,
     )
 
 
-def secant(state: State, delta: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+def look(sample: Sampler, warp: Tensor, pixels: Tensor, patch: Tensor, busy: Any) -> Tensor:
+    """The patches (B, N) at ``warp`` (B, 2, 3); where the host knows who is ``busy`` (B,), the others are as before."""
+    if isinstance(busy, Tensor) or busy.all():
+        return sample(warp, pixels)
+    index = torch.from_numpy(busy.nonzero()[0])
+    return patch.index_copy(0, index, sample.select(index)(warp[index], pixels))
+
+
+def norm(vector: Any) -> Any:
+    """Length (B,) of vectors (B, n)."""
+    return (vector * vector).sum(-1) ** 0.5
+
+
+def secant(state: State, delta: Any, length: Any) -> tuple[Any, Any]:
     """Stretch of an increment ``delta`` (B, 3) of the given ``length`` (B,), and the rate of convergence, (B,) each.
 
     Noise in the template shortens every step by one factor, so that steps shrink in a geometric series. Two of them
     tell its sum (the secant method on their common line). Only near the answer, where steps are such a series, and
     within one stage: another sampler or other pixels have another answer, to which the first step is no part of it.
     """
-    last = torch.linalg.vector_norm(state.delta, dim=-1)
-    rate = torch.where(last > 0, length / last, 0.5).clamp(0.05, 0.95)
+    xp, last = library(delta), norm(state.delta)
+    rate = xp.where(last > 0, length / last, 0.5).clip(0.05, 0.95)
     along = (state.delta * delta).sum(-1) / (last * last)  # = 1 - (last stretch) * (share that a step covers)
-    usable = (last < SECANT_RANGE) & (along < 0.9) & state.error.isfinite()
-    return torch.where(usable, (state.factor / (1 - along)).clamp(1.0, LARGEST_STRETCH), 1.0), rate
+    usable = (last < SECANT_RANGE) & (along < 0.9) & (state.error < xp.inf)
+    return xp.where(usable, (state.factor / (1 - along)).clip(1.0, LARGEST_STRETCH), 1.0), rate
 
 
+@np.errstate(all="ignore")
 def iterate(reference: Reference, sample: Sampler, state: State, tolerance: float, budget: int) -> State:
-    """Gauss-Newton until every predicted error is below ``tolerance`` or ``budget`` iterations are spent."""
-    result, index = state, torch.arange(len(state.pose), device=state.pose.device)
-    period = check_period(index.device)
-    for k in range(1, budget + 1):
-        state = gauss_newton(reference, sample, state, tolerance)
-        if k < budget and k % period == 0:
-            busy = (state.error > tolerance).nonzero()[:, 0]
-            if len(busy) == 0:
-                break
-            if len(busy) < len(index):  # converged elements stop costing
-                result = result.merge(index, state)
-                index, state = index[busy], state.select(busy)
-                reference, sample = reference.select(busy), sample.select(busy)
-    return result.merge(index, state)
+    """Gauss-Newton until every predicted error is below ``tolerance`` or ``budget`` iterations are spent.
+
+    An accelerator does them all, so that the host need not know: what has converged is masked. A CPU stops when it can,
+    and leaves the algebra of poses to numpy, a call of which takes it a third of the time of torch's.
+    """
+    state = state._replace(patch=torch.zeros_like(reference.K[:, 0]))
+    if not host_looks(reference.K.device):
+        for _ in range(budget):
+            state = gauss_newton(reference, sample, state, tolerance)
+        return state
+    state = State._make([*(v.numpy() for v in state[:-1]), state.patch])
+    while budget and (state.error > tolerance).any():
+        state, budget = gauss_newton(reference, sample, state, tolerance), budget - 1
+    return State._make([*map(torch.from_numpy, state[:-1]), state.patch])
 
 
-def check_period(device: torch.device) -> int:
-    """Iterations between two looks at what has converged: each look stops an accelerator, and costs a CPU nothing."""
-    return 1 if device.type == "cpu" else 4
+def refine(
+    reference: Reference, image: Tensor, state: State, settings: Settings, *, border: bool
+) -> tuple[State, Tensor]:
+    """From a start within the basin to the answer: bilinear and few pixels first, then all that is asked for.
+
+    And which templates (B,) are settled: all with ``border``; without it no pixel may drop out of sight, and those
+    that come near the border are left alone.
+    """
+    size, settled = (image.shape[-2], image.shape[-1]), torch.ones_like(state.pose[:, 0], dtype=torch.bool)
+    for part, interpolation, tolerance, budget in stages(reference, settings):
+        if border:
+            state = stage(part, image, state, interpolation, tolerance, budget)
+            continue
+        warp = warps(reference, state.pose)
+        settled = settled & inside(warp, reference.box, size, margin=EDGE).all(-1)
+        state = state._replace(error=torch.where(settled, torch.inf, 0.0).to(state.pose.dtype))
+        state = iterate(part, make_sampler(interpolation, image, warp, reference.box), state, tolerance, budget)
+    if not border:
+        settled = settled & inside(warps(reference, state.pose), reference.box, size).all(-1)
+    return state, settled
 
 
-def refine(reference: Reference, image: Tensor, state: State, settings: Settings) -> State:
-    """From a start within the basin to the answer: bilinear and few pixels first, then all that is asked for."""
-    budget, thin, patch = settings.max_iterations, reference.thin, state.patch
-    if budget > 1 and (settings.interpolation != "bilinear" or thin is not reference):
-        coarse = max(budget * 2 // 3, 1)
-        state = state._replace(patch=patch[:, : thin.K.shape[-1]])
-        state = stage(thin, image, state, "bilinear", max(settings.tolerance, COARSE_TOLERANCE), coarse)
-        state = state._replace(patch=patch)
-        budget -= coarse
-    return stage(reference, image, state, settings.interpolation, settings.tolerance, budget)
+def stages(reference: Reference, settings: Settings) -> list[tuple[Reference, str, float, int]]:
+    """What to do one after the other: the pixels, the sampler, the tolerance in px and the iterations at most."""
+    thin, budget = reference.thin, settings.max_iterations
+    last = (reference, settings.interpolation, settings.tolerance, budget)
+    if budget == 1 or (settings.interpolation == "bilinear" and thin is reference):
+        return [last]
+    coarse = max(budget * 2 // 3, 1)
+    first = (thin, "bilinear", max(settings.tolerance, COARSE_TOLERANCE), coarse)
+    return [first, (*last[:3], budget - coarse)]
 
 
 def stage(
     reference: Reference, image: Tensor, state: State, interpolation: str, tolerance: float, budget: int
 ) -> State:
     """``iterate`` with one sampler; templates that reach beyond the frame are weighed anew at every iteration."""
-    state = state._replace(error=torch.full_like(state.error, float("inf")))
+    state = state._replace(error=torch.full_like(state.error, torch.inf))
     warp, size = warps(reference, state.pose), (image.shape[-2], image.shape[-1])
     sample = make_sampler(interpolation, image, warp, reference.box)
     whole = inside(warp, reference.box, size, margin=EDGE).all(-1)
@@ -170,5 +203,6 @@ def stage(
         some = index.nonzero()[:, 0]
         if len(some):
             part = sample._replace(edge=edge).select(some)
-            state = state.merge(some, iterate(reference.select(some), part, state.select(some), tolerance, budget))
+            found = iterate(reference.select(some), part, state.select(some), tolerance, budget)
+            state = state._replace(patch=torch.zeros_like(reference.K[:, 0])).merge(some, found)
     return state

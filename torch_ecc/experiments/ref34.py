@@ -16,8 +16,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_ecc.noise import INSTRUMENT_BLUR
 from torch_ecc.pose import rotation
-from torch_ecc.reference import INSTRUMENT_BLUR, MARGIN
+from torch_ecc.reference import MARGIN
 from torch_ecc.sampling import Sampler, blur, gradients, make_sampler
 from torch_ecc.solver import COARSE_TOLERANCE
 
