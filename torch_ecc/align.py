@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -10,7 +12,10 @@ from torch_ecc.estimate import Estimate
 from torch_ecc.frame import as_image, require_tensor
 from torch_ecc.judge import judge
 from torch_ecc.reference import Reference
+from torch_ecc.sampling import host_looks
 from torch_ecc.solver import Settings, State, refine
+
+UNSETTLED = -1  # the status of a template at the frame's border, which takes another way
 
 
 @torch.no_grad()
@@ -74,6 +79,9 @@ def solve_in_torch(
     Without ``border`` templates that come near it are not settled: status -1. No device but the CPU is then stopped
     for the host to look at a value, so that a CUDA graph can hold all of it.
     """
-    state, settled = refine(reference, image.float(), State.start(reference, pose), settings, border=border)
-    estimate = judge(reference, state, pose, settings, (image.shape[-2], image.shape[-1]) if border else None)
-    return estimate if border else estimate._replace(status=torch.where(settled, estimate.status, -1).to(torch.int8))
+    start: Any = pose.numpy() if host_looks(pose.device) and not border else pose
+    state, settled = refine(reference, image, State.start(reference, start), settings, border=border)
+    estimate = judge(reference, state, start, settings, (image.shape[-2], image.shape[-1]) if border else None)
+    if border:
+        return estimate
+    return estimate._replace(status=torch.where(torch.as_tensor(settled), estimate.status, UNSETTLED))

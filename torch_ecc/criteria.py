@@ -8,10 +8,12 @@ matrix K, and the step is a simple function of K g.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+
+from torch_ecc.pose import alike, library
 
 if TYPE_CHECKING:
     from torch_ecc.reference import Reference
@@ -63,23 +65,29 @@ class ECC:
 
         t stands without its mean, which the column 1 makes up for: on a high pedestal the two would look alike.
         """
-        u, v = uv[:, :1], uv[:, 1:]
-        light = (u, v, u * u, v * v, u * v)[: ILLUMINATION[self.illumination]]
         t = signal[:, 3:]
         contrast = t - t.mean(-1, keepdim=True)
-        return torch.cat((signal[:, :3], contrast, torch.ones_like(t), *(t * f for f in light)), 1)
+        return torch.cat((signal[:, :3], contrast, torch.ones_like(t), t * self.light(uv)), 1)
+
+    def light(self, uv: Tensor) -> Tensor:
+        """What the gain may vary by over the template: u, v, u^2, v^2, u v, (B, 0 | 2 | 5, N)."""
+        if self.illumination != "quadratic":
+            return uv[:, : ILLUMINATION[self.illumination]]
+        return torch.cat((uv, uv * uv, uv[:, :1] * uv[:, 1:]), 1)
 
     def step(self, reference: Reference, g: Tensor) -> Tensor:
         """b / a, (B, 3); infinite or NaN where the gain a is not positive."""
-        u = (reference.K[:, :4] @ (g - g.mean(-1, keepdim=True))[:, :, None])[:, :, 0]
+        g = g - g[:, :1]  # K does not see a constant, but its sums stay small
+        u = torch.bmm(reference.K[:, :4], g[:, :, None])[:, :, 0]
         return u[:, :3] / u[:, 3:].clamp(min=0)
 
     def fit(self, reference: Reference, g: Tensor) -> Fit:
         """g minus all columns; the gain is the coefficient a of t."""
-        g = g - g.mean(-1, keepdim=True)
-        u = reference.K @ g[:, :, None]
-        R = self.columns(reference.signal, reference.uv)
-        return Fit(g - (u.mT @ R)[:, 0], u[:, 3, 0])
+        g, t = g - g.mean(-1, keepdim=True), reference.signal[:, 3]
+        u = torch.bmm(reference.K, g[:, :, None]).mT
+        light = (u[:, :, 5:] @ self.light(reference.uv))[:, 0] if self.illumination != "gain" else 0.0
+        constant = u[:, :, 4] - u[:, :, 3] * t.mean(-1, keepdim=True)
+        return Fit(g - constant - torch.bmm(u[:, :, :4], reference.signal)[:, 0] - light * t, u[:, 0, 3])
 
 
 @dataclass(frozen=True)
@@ -127,18 +135,19 @@ def centred(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return rest, (rest * rest * weight).sum(-1).sqrt()
 
 
-def safe_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
+def safe_inverse(matrix: Any) -> tuple[Any, Any]:
     """Inverse (B, n, n), zero where ``matrix`` is singular to float32, and whether it is regular, (B,) bool.
 
-    Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude.
+    Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude. Tensors or
+    numpy arrays.
     """
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    scale = diagonal.abs().clamp(min=1e-30).rsqrt()
-    unit = matrix * scale[:, :, None] * scale[:, None, :]
-    inverse, _ = torch.linalg.inv_ex(unit)
-    regular = (inverse.abs().sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
-    inverse = torch.where(regular[:, None, None], inverse, 0.0)
-    return inverse * scale[:, :, None] * scale[:, None, :], regular
+    xp = library(matrix)
+    diagonal = xp.diagonal(matrix, 0, -2, -1)
+    scale = abs(diagonal).clip(1e-30) ** -0.5
+    scale = scale[:, :, None] * scale[:, None, :]
+    inverse = alike(torch.linalg.inv_ex(torch.as_tensor(matrix * scale))[0], matrix)
+    regular = (abs(inverse).sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
+    return xp.where(regular[:, None, None], inverse * scale, 0.0), regular
 
 
 def make_criterion(criterion: str | Criterion, illumination: str = "linear") -> Criterion:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from torch_ecc.criteria import centred, safe_inverse
 from torch_ecc.estimate import Estimate, Status
-from torch_ecc.pose import rotation
+from torch_ecc.pose import alike, library, rotation
 from torch_ecc.reference import ALIASING, Reference, reweigh
 from torch_ecc.sampling import NOISE_GAIN, host_looks, inside
 from torch_ecc.solver import Settings, State, warps
@@ -16,52 +19,90 @@ LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not 
 NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
+FIGURES = ("box", "radius", "noise", "alias", "slope", "spread", "inflation", "spread_noise", "noise_share", "moments")
 
 
+class Sums(NamedTuple):
+    """What all pixels of B patches tell, (B,) each: the patch's ``gain``, the residual's mean square ``power``, the
+    correlation ``score``, the same ``alike`` under uneven light; and (B, 3) the residual's sums by ``blocks``."""
+
+    gain: Any
+    power: Any
+    score: Any
+    alike: Any
+    blocks: Any
+
+
+@np.errstate(all="ignore")
 def judge(
-    reference: Reference, state: State, start: Tensor, settings: Settings, size: tuple[int, int] | None = None
+    reference: Reference, state: State, start: Any, settings: Settings, size: tuple[int, int] | None = None
 ) -> Estimate:
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back.
 
     ``size`` (h, w) of the frame: only pixels inside it count. None if all are known to be.
     """
-    pose, whole, visible = state.pose, reference, torch.ones_like(state.error)
+    pose, whole, xp = state.pose, reference, library(state.pose)
     if size is not None:
-        reference = reweigh(reference, inside(warps(reference, pose), reference.pixels, size))
-        visible = reference.moments[:, 1] / whole.moments[:, 1]
-    residual, gain = reference.criterion.fit(reference, state.patch)
-    gain = gain.to(pose.dtype).nan_to_num(0.0, 0.0, 0.0)
-    power = (reference.weight * residual * residual).sum(-1) / reference.moments[:, 1].clamp(min=1e-30)
-    power = power.nan_to_num(0.0, 0.0, 0.0)
-    score = correlation(reference.signal[:, 3], state.patch, reference.weight).to(pose.dtype)
+        reference = reweigh(reference, inside(torch.as_tensor(warps(reference, pose)), reference.pixels, size))
+    sums = Sums(*(alike(value, pose) for value in add_up(reference, state.patch, settings.min_score)))
+    reference, whole = (
+        r._replace(**{name: alike(getattr(r, name), pose) for name in FIGURES}) for r in (reference, whole)
+    )
+    gain, power = (xp.where(abs(v) < xp.inf, v, 0.0) for v in (sums.gain, sums.power))
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
-    structure = clustering(reference, residual, noise * (1 + gain * gain))
+    structure = clustering(reference, sums.blocks, noise * (1 + gain * gain))
     sampler = interpolation_error(reference, pose, settings.interpolation)
     covariance, fixed = pose_covariance(reference, noise, gain, pose, structure, sampler)
-    shown = visible >= settings.min_visible
-    alike = score
-    if not host_looks(score.device) or bool((score < settings.min_score).any()):
-        # Light alone must not make a stranger of the template.
-        alike = torch.maximum(score, flat_correlation(reference, state.patch).to(pose.dtype))
-    match = (alike >= settings.min_score) & (gain > 0) & pose.isfinite().all(-1)
+    shown = reference.moments[:, 1] >= settings.min_visible * whole.moments[:, 1]
+    match = (sums.alike >= settings.min_score) & (gain > 0) & (abs(pose) < xp.inf).all(-1)
     status = decide(whole, shown, match, fixed, state.error <= settings.tolerance)
     good = Status.good(status)
-    pose = torch.where(good[:, None], pose, start)
-    unknown = torch.full_like(pose, float("inf")).diag_embed()
-    covariance = torch.where(good[:, None, None], covariance, unknown)
-    return Estimate(pose, pose - start, score, status, state.iterations, covariance, power.sqrt())
+    pose = xp.where(good[:, None], pose, start)
+    diagonal = alike(torch.eye(3, device=state.patch.device), start) > 0
+    covariance = xp.where(good[:, None, None], covariance, xp.where(diagonal, xp.inf, 0.0))
+    fields = pose, pose - start, sums.score, status, state.iterations, covariance, power**0.5
+    return Estimate(*map(torch.as_tensor, fields))
 
 
-def decide(reference: Reference, shown: Tensor, match: Tensor, fixed: Tensor, converged: Tensor) -> Tensor:
+def decide(reference: Reference, shown: Any, match: Any, fixed: Any, converged: Any) -> Any:
     """Status codes (B,) int8 from what was found, (B,) bool each: enough of it is ``shown``, it is a ``match``, its
     texture has ``fixed`` the pose, the iterations have ``converged``."""
-    status = torch.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
-    status = torch.where(fixed, status, int(Status.LOW_TEXTURE))
-    status = torch.where(match, status, int(Status.LOST))
-    status = torch.where(shown, status, int(Status.OUT_OF_VIEW))
-    empty = reference.noise.square() * reference.noise_share > DOUBTFUL_SHARE
-    status = torch.where(empty & ~(match & shown), int(Status.LOW_TEXTURE), status)  # without texture: that is why
-    return status.to(torch.int8)
+    xp = library(shown)
+    status = xp.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
+    status = xp.where(fixed, status, int(Status.LOW_TEXTURE))
+    status = xp.where(match, status, int(Status.LOST))
+    status = xp.where(shown, status, int(Status.OUT_OF_VIEW))
+    empty = reference.noise**2 * reference.noise_share > DOUBTFUL_SHARE
+    status = xp.where(empty & ~(match & shown), int(Status.LOW_TEXTURE), status)  # without texture: that is why
+    return xp.asarray(status, dtype=xp.int8)
+
+
+def add_up(reference: Reference, patch: Tensor, min_score: float) -> Sums:
+    """What there is to know from the pixels (B, N) of B patches."""
+    residual, gain = reference.criterion.fit(reference, patch)
+    weight, total = reference.weight, reference.moments[:, 1].to(patch.dtype)
+    power = dot(weight * residual, residual) / total.clamp(min=1e-30)
+    mean = dot(weight, patch) / total.clamp(min=1e-30)
+    rest = patch - mean[:, None]
+    weighted = weight * rest
+    square, norm = dot(weighted, rest), reference.moments[:, 3].to(patch.dtype)
+    score = dot(weighted, reference.signal[:, 3] - reference.moments[:, 2:3].to(patch.dtype)) / (
+        square.sqrt() * norm
+    ).clamp(min=1e-30)
+    score = torch.where(square.sqrt() * norm > 1e-12 * (square + mean * mean * total), score, 0.0).clamp(-1, 1)
+    alike = score
+    if not host_looks(score.device) or bool((score < min_score).any()):
+        # Light alone must not make a stranger of the template.
+        alike = torch.maximum(score, flat_correlation(reference, patch))
+    sums = patch.new_zeros(len(patch), 3, len(reference.block_sizes))
+    sums.index_add_(2, reference.block, reference.K[:, :3] * residual[:, None])
+    return Sums(gain, power, score, alike, sums.square().sum(-1))
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Sums (B,) of the products of (1 or B, N) and (B, N)."""
+    product: Tensor = torch.linalg.vecdot(a, b)
+    return product
 
 
 def correlation(t: Tensor, g: Tensor, weight: Tensor) -> Tensor:
@@ -84,57 +125,51 @@ def flat_correlation(reference: Reference, g: Tensor) -> Tensor:
     return correlation(t, g, reference.weight)
 
 
-def noise_variance(reference: Reference, power: Tensor, gain: Tensor, sampled: float) -> Tensor:
+def noise_variance(reference: Reference, power: Any, gain: Any, sampled: float) -> Any:
     """Variance (B,) of the noise of one image, from the residuals' mean square ``power`` (B,) = the template's share
     gain^2 v plus the frame's, of which its sampling left ``sampled`` v; freed of the fitted columns' part."""
     count, columns = reference.moments[:, 0], reference.K.shape[1]
-    return power * count / (count - columns).clamp(min=1) / (gain * gain + sampled)
+    return power * count / (count - columns).clip(1) / (gain * gain + sampled)
 
 
-def clustering(reference: Reference, residual: Tensor, power: Tensor) -> Tensor:
-    """How much more the increment scatters, (B, 3), with ``residual`` (B, N) than with white noise of ``power`` (B,).
+def clustering(reference: Reference, clustered: Any, power: Any) -> Any:
+    """How much more the increment scatters, (B, 3), than with white noise of ``power`` (B,).
 
     What no noise model knows (edges that the sampler rounds, light, an occluder, blur) leaves residuals that cling
-    together where the gradients are. Their effect summed block by block tells the scatter that they bring (the
-    cluster-robust sandwich); 1 where it is not more than the white one's.
+    together where the gradients are. Their effect summed block by block, its squares ``clustered`` (B, 3), tells the
+    scatter that they bring (the cluster-robust sandwich); 1 where it is not more than the white one's.
     """
-    K, blocks, columns = reference.K[:, :3], len(reference.block_sizes), reference.K.shape[1]
+    blocks, columns = len(reference.block_sizes), reference.K.shape[1]
     if blocks < FEW_BLOCKS * columns:  # too few to tell a scatter from
-        return torch.ones_like(power)[:, None].expand(-1, 3)
-    sums = K.new_zeros(len(K), 3, blocks).index_add_(2, reference.block, K * residual[:, None])
+        return 0 * clustered + 1
     few = blocks / (blocks - columns)  # blocks are not free: the fit has made their sum zero
-    white = K.square().sum(-1).to(power.dtype) * power[:, None]
-    return (few * sums.square().sum(-1).to(power.dtype) / white.clamp(min=1e-30)).clamp(min=1.0).sqrt()
+    white = reference.moments[:, 4:] * power[:, None]
+    return (few * clustered / white.clip(1e-30)).clip(1.0) ** 0.5
 
 
-def interpolation_error(reference: Reference, pose: Tensor, interpolation: str) -> Tensor:
+def interpolation_error(reference: Reference, pose: Any, interpolation: str) -> Any:
     """Covariance (B, 3, 3), in the template's axes, of what aliasing in the sampler shifts poses (B, 3) by.
 
     Where all pixels lie alike between the frame's (no rotation) their errors add up; over a turned template they
     cancel. The shift is ``Reference.alias`` times the sine of the phase, whose mean square is one half.
     """
     if interpolation not in ALIASING:
-        return pose.new_zeros(len(pose), 3, 3)
-    shift = reference.alias[:, ALIASING.index(interpolation)]
-    width, height = (reference.box[:2, 2] - reference.box[:2, 0] + 1).to(pose.dtype)
-    alike = _alike(pose[:, 2].cos(), width) * _alike(pose[:, 2].sin(), height)
-    return shift @ shift.mT * (alike.square() / 2)[:, None, None]
+        return 0.0
+    xp, shift = library(pose), reference.alias[:, ALIASING.index(interpolation)]
+    width, height = reference.box[:2, 2] - reference.box[:2, 0] + 1
+    alike = _alike(xp.cos(pose[:, 2]), width) * _alike(xp.sin(pose[:, 2]), height)
+    return shift @ xp.swapaxes(shift, -1, -2) * (alike * alike / 2)[:, None, None]
 
 
-def _alike(step: Tensor, count: Tensor) -> Tensor:
+def _alike(step: Any, count: Any) -> Any:
     """Mean of exp(2 pi i k step) over ``count`` neighbours k, but for its phase: 1 for whole steps (Dirichlet)."""
     step = step - step.round()
-    return torch.sinc(count * step) / torch.sinc(step)
+    return library(step).sinc(count * step) / library(step).sinc(step)
 
 
 def pose_covariance(
-    reference: Reference,
-    noise: Tensor,
-    gain: Tensor,
-    pose: Tensor,
-    structure: Tensor | None = None,
-    sampler: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+    reference: Reference, noise: Any, gain: Any, pose: Any, structure: Any = None, sampler: Any = 0.0
+) -> tuple[Any, Any]:
     """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of variance ``noise`` (B,), the patch
     ``gain`` (B,) times the template's contrast; and whether the texture fixes the pose, (B,) bool.
 
@@ -143,19 +178,18 @@ def pose_covariance(
     derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``structure`` (B, 3): see
     ``clustering``; ``sampler`` (B, 3, 3): see ``interpolation_error``.
     """
-    own = torch.minimum(noise, reference.noise.to(noise.dtype) ** 2)
-    inverse, regular = safe_inverse(reference.slope - own[:, None, None] * reference.inflation)
+    xp = library(pose)
+    own = xp.minimum(noise, reference.noise**2)
     textured = own * reference.noise_share < NOISE_SHARE
-    frame = (1 / (gain * gain).clamp(min=1e-12))[:, None, None]
-    spread = (1 + frame) * reference.spread - own[:, None, None] * reference.spread_noise
-    local = inverse @ spread @ inverse.mT * noise[:, None, None]
+    noise, own, frame = (v[:, None, None] for v in (noise, own, 1 / (gain * gain).clip(1e-12)))
+    inverse, regular = safe_inverse(reference.slope - own * reference.inflation)
+    spread = (1 + frame) * reference.spread - own * reference.spread_noise
+    local = inverse @ spread @ xp.swapaxes(inverse, -1, -2) * noise
     if structure is not None:
         local = local * structure[:, :, None] * structure[:, None, :]
-    if sampler is not None:
-        local = local + sampler
-    turn = torch.eye(3, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)
-    turn[:, :2, :2] = rotation(pose[:, 2])
-    covariance = turn @ local @ turn.mT
-    diagonal = covariance.diagonal(dim1=-2, dim2=-1)
-    corner = diagonal[:, 0] + diagonal[:, 1] + diagonal[:, 2] * reference.radius**2
+    zero = xp.zeros_like(pose[:, :2, None])
+    turn = xp.concatenate((rotation(pose[:, 2]), zero), -1)
+    turn = xp.concatenate((turn, xp.swapaxes(xp.concatenate((zero, zero[:, :1] + 1), 1), -1, -2)), 1)
+    covariance = turn @ (local + sampler) @ xp.swapaxes(turn, -1, -2)
+    corner = covariance[:, 0, 0] + covariance[:, 1, 1] + covariance[:, 2, 2] * reference.radius**2
     return covariance, regular & textured & (corner < LARGEST_SIGMA**2)

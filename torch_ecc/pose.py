@@ -40,7 +40,7 @@ def library(array: Any) -> Any:
 
 def alike(tensor: Tensor, array: Any) -> Any:
     """``tensor`` in the library and the dtype of ``array``."""
-    return tensor.to(array.dtype) if isinstance(array, Tensor) else tensor.numpy()
+    return tensor.to(array.dtype) if isinstance(array, Tensor) else tensor.numpy().astype(array.dtype, copy=False)
 
 
 def rotation(theta: Array) -> Array:

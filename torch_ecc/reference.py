@@ -54,8 +54,8 @@ class Reference(NamedTuple):
     ``noise_share`` (B,) is the largest part of ``slope`` that such noise can be, in any direction.
 
     For the first iterations: ``sparse`` (n,), pixels on a coarser grid; ``K_sparse`` (B, p, n), made from them alone,
-    and what else ``PIXELWISE`` names, there. ``moments`` (B, 4): how many pixels count, the sum of their weights, their
-    weighted mean and the weighted norm of what is left of them.
+    and what else ``PIXELWISE`` names, there. ``moments`` (B, 7): how many pixels count, the sum of their weights, their
+    weighted mean, the weighted norm of what is left of them, and the square sums of the first rows of K.
     """
 
     criterion: Criterion
@@ -199,7 +199,7 @@ def _assemble(criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor,
     step = min(max(math.isqrt(pixels.shape[1] // ENOUGH), 1), SPARSEST)
     sparse = ((column % step == 0) & (row % step == 0)).nonzero()[:, 0]
     few = [v[..., sparse] for v in (signal, pixels, signal, instrument, trust[:, 0], weight)]
-    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, *few, nothing[:, 0])
+    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, *few, radius)
     reference = Reference(criterion, *constants, *rest)
     thin = reweigh(reference.thin, few[-1] > 0)
     return reweigh(reference._replace(K_sparse=thin.K), weight > 0)
@@ -221,7 +221,6 @@ def reweigh(reference: Reference, seen: Tensor) -> Reference:
     total = weight.sum(-1, keepdim=True)
     level = (t * weight).sum(-1, keepdim=True) / total.clamp(min=1e-30)
     count, spread = (weight > 0).sum(-1, keepdim=True), (weight * (t - level) ** 2).sum(-1, keepdim=True).sqrt()
-    moments = torch.cat([v.expand_as(level).to(dtype) for v in (count, total, level, spread)], 1)
     normal, power = (ZW @ R.mT).to(dtype), (ZW @ ZW.mT).to(dtype)
     inverse, regular = safe_inverse(normal)
     others, _ = safe_inverse(normal[:, 3:, 3:])
@@ -230,13 +229,15 @@ def reweigh(reference: Reference, seen: Tensor) -> Reference:
     slope = (project @ normal)[:, :, :3] * regular[:, None, None]
     local = reference.pixels[:2] - reference.centre[:, :, None]
     inflation = noise_slope(local, weight * reference.trust).to(dtype) * noise_response()[0]
+    K = (inverse @ ZW.to(dtype)).to(R.dtype)
+    moments = [v.expand_as(level).to(dtype) for v in (count, total, level, spread)]
     return reference._replace(
         weight=weight,
-        K=(inverse @ ZW.to(dtype)).to(R.dtype),
+        K=K,
         slope=slope,
         spread=project @ power @ project.mT,
         inflation=inflation,
         spread_noise=noise_slope(local, (weight * reference.trust).square()).to(dtype) * noise_response()[1],
         noise_share=largest_share(slope, inflation),
-        moments=moments,
+        moments=torch.cat([*moments, K[:, :3].square().sum(-1).to(dtype)], 1),
     )

@@ -7,14 +7,18 @@ pixel centres at integers, and a warp is a 2x3 matrix that takes homogeneous tem
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
+from torch_ecc.pose import alike
+
 REACH = 10  # px around a patch that its B-spline still feels: 0.43 ** 10 = 2e-4 of the border's contrast, at degree 5
+LOOKED_AT = {"cpu"}  # devices that let the host see a value without waiting for it
 TAPS = {3: (4 / 6, 1 / 6), 5: (66 / 120, 26 / 120, 1 / 120)}  # centred B-splines at 0, 1, 2
 SLOPE = {3: (0.0, 1 / 2), 5: (0.0, 10 / 24, 1 / 24)}  # minus their derivatives there
 # Variance of white noise after sampling, mean over all sub-pixel phases: a sampler smooths what lies between pixels.
@@ -33,7 +37,8 @@ class Bilinear(NamedTuple):
     def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
         """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside the image its border repeats."""
         scale, shift = _unit_square(*self.image.shape[-2:], warp.dtype, warp.device)
-        return _lookup(self.image, torch.addcmul(shift, warp, scale).to(pixels.dtype) @ pixels)
+        points = torch.addcmul(shift, warp, scale).to(pixels.dtype) @ pixels
+        return _lookup(self.image, points.mT[:, None])[:, 0]
 
     def select(self, index: Tensor) -> Bilinear:
         """The sampler of some of the templates."""
@@ -61,16 +66,18 @@ class BSpline(NamedTuple):
         points = local.to(pixels.dtype) @ pixels
         scale, shift = _unit_square(*self.coefficients.shape[-2:], points.dtype, points.device)
         floor = points.floor()
-        pairs = []  # per pair of taps: total weight and normalised coordinate of their lookup, both (B, 2, N)
-        for first, total, second in _pairs(points - floor, self.degree):
-            pairs.append((total, (floor + (second / total + first)).mul_(scale).add_(shift[:, 2:])))
-        values = torch.zeros_like(points[:, 0])
-        for wx, x in pairs:
-            for wy, y in pairs:
-                # The coefficients mirror at the border, as the prefilter has assumed.
-                look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), 1), "reflection")
-                values.addcmul_(look, wx[:, 0] * wy[:, 1])
-        return values
+        first, total, second = zip(*_pairs(points - floor, self.degree), strict=True)
+        pairs = len(first)
+        at = torch.stack([floor + (b / a + k) for k, a, b in zip(first, total, second, strict=True)], 1)
+        at = torch.addcmul(shift[:, 2:], at, scale)  # (B, pairs, 2, N): where each pair of taps is looked up
+        grid = torch.stack(
+            (at[:, None, :, 0].expand(-1, pairs, -1, -1), at[:, :, None, 1].expand(-1, -1, pairs, -1)), -1
+        )
+        # The coefficients mirror at the border, as the prefilter has assumed.
+        values = _lookup(self.coefficients, grid.flatten(1, 2), "reflection").unflatten(1, (pairs, pairs))
+        wx, wy = torch.stack(total, 1).unbind(2)
+        value: Tensor = ((values * wx[:, None]).sum(2) * wy).sum(1)
+        return value
 
     def select(self, index: Tensor) -> BSpline:
         """The sampler of some of the templates."""
@@ -87,44 +94,42 @@ def host_looks(device: torch.device) -> bool:
 
     It decides nothing but what is left undone: iterations after convergence, pixels of the frame far from a template.
     """
-    return device.type == "cpu"
+    return device.type in LOOKED_AT
 
 
-def make_sampler(interpolation: str, image: Tensor, warp: Tensor, box: Tensor) -> Sampler:
+def make_sampler(interpolation: str, image: Tensor, warp: Any, box: Tensor) -> Sampler:
     """The sampler of ``image`` (I, 1, H, W) around the patches ``warp`` (B, 2, 3) of the template rectangle.
 
     ``box`` (3, 4): the rectangle's corners. A B-spline is prefiltered only in the neighbourhood of the patches, unless
     so many share one image that filtering all of it is less work; on an accelerator always all of it.
     """
     if interpolation == "bilinear":
-        return Bilinear(image)
-    degree = int(interpolation[-1])
-    if not host_looks(image.device):
-        return BSpline(prefilter(image, degree), warp.new_zeros(1, 2), degree)
-    h, w = image.shape[-2:]
-    corners = warp @ box.to(warp.dtype)
-    low = corners.amin(-1).floor() - REACH
-    extent = int((corners.amax(-1).ceil() + REACH - low).amax()) + 1
-    side = -(-extent // 16) * 16  # few different sizes, so that the prefilter matrices are reused
-    shared = len(image) == 1 and len(warp) * 2 * side**3 >= h * w * (h + w)
-    if shared or side > min(h, w):
-        return BSpline(prefilter(image, degree), warp.new_zeros(1, 2), degree)
-    low = torch.minimum(low, low.new_tensor((w - side, h - side))).clamp(min=0)  # what lies beyond is not sampled
-    return BSpline(prefilter(_crop(image, low.long(), side), degree), low, degree)
+        return Bilinear(image.float())
+    degree, (h, w) = int(interpolation[-1]), image.shape[-2:]
+    if host_looks(image.device):
+        corners = np.asarray(warp) @ np.asarray(box)
+        low = np.floor(corners.min(-1)) - REACH
+        extent = int((np.ceil(corners.max(-1)) + REACH - low).max()) + 1
+        side = -(-extent // 16) * 16  # few different sizes, so that the prefilter matrices are reused
+        shared = len(image) == 1 and len(warp) * 2 * side**3 >= h * w * (h + w)
+        if not shared and side <= min(h, w):
+            low = np.clip(low, 0, (w - side, h - side)).astype(int)  # what lies beyond is not sampled
+            return BSpline(prefilter(_crop(image, low, side), degree), torch.from_numpy(low), degree)
+    return BSpline(prefilter(image.float(), degree), torch.zeros(1, 2, device=image.device), degree)
 
 
-def inside(warp: Tensor, pixels: Tensor, size: tuple[int, int], margin: float = 0.0) -> Tensor:
+def inside(warp: Any, pixels: Tensor, size: tuple[int, int], margin: float = 0.0) -> Any:
     """Which ``pixels`` (3, N) the ``warp`` (B, 2, 3) puts at least ``margin`` px inside a frame (h, w): bool (B, N)."""
-    x, y = (warp.to(pixels.dtype) @ pixels).unbind(1)
+    points = warp @ alike(pixels, warp)
+    x, y = points[:, 0], points[:, 1]
     h, w = size
     return (x >= margin) & (x <= w - 1 - margin) & (y >= margin) & (y <= h - 1 - margin)
 
 
-def _crop(image: Tensor, origin: Tensor, side: int) -> Tensor:
-    """Squares (B, 1, side, side) of ``image`` (1 or B, 1, H, W) from ``origin`` (B, 2) = (x, y), all inside it."""
-    windows = image[:, 0].unfold(1, side, 1).unfold(2, side, 1)  # a view: every square there is
-    which = torch.arange(len(image), device=image.device)
-    return windows[which, origin[:, 1], origin[:, 0]][:, None]
+def _crop(image: Tensor, origin: Any, side: int) -> Tensor:
+    """Squares (B, 1, side, side), float, of ``image`` (1 or B, 1, H, W) from ``origin`` (B, 2) = (x, y), all inside."""
+    views = zip(image.expand(len(origin), -1, -1, -1), origin.tolist(), strict=True)
+    return torch.stack([view[:, y : y + side, x : x + side] for view, (x, y) in views]).float()
 
 
 def _mirror(index: Tensor, size: int) -> Tensor:
@@ -140,11 +145,10 @@ def _unit_square(h: int, w: int, dtype: torch.dtype, device: torch.device) -> tu
     return scale, torch.tensor([[0, 0, -1.0]] * 2, dtype=dtype, device=device)
 
 
-def _lookup(image: Tensor, points: Tensor, beyond: str = "border") -> Tensor:
-    """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, 2, N): (B, N)."""
-    grid = points.movedim(1, -1)[:, None]
-    image = image.expand(len(points), -1, -1, -1)
-    return F.grid_sample(image, grid, mode="bilinear", padding_mode=beyond, align_corners=True)[:, 0, 0]
+def _lookup(image: Tensor, grid: Tensor, beyond: str = "border") -> Tensor:
+    """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, M, N, 2): (B, M, N)."""
+    image = image.expand(len(grid), -1, -1, -1)
+    return F.grid_sample(image, grid, mode="bilinear", padding_mode=beyond, align_corners=True)[:, 0]
 
 
 def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -65,10 +66,15 @@ class State(NamedTuple):
     patch: Tensor
 
     @staticmethod
-    def start(reference: Reference, pose: Tensor) -> State:
+    def start(reference: Reference, pose: Any) -> State:
         """Before the first iteration."""
-        one, count = torch.ones_like(pose[:, 0]), torch.zeros_like(pose[:, 0], dtype=torch.int64)
-        return State(pose, torch.zeros_like(pose), one, one * torch.inf, count, torch.zeros_like(reference.K[:, 0]))
+        xp = library(pose)
+        one, count = xp.ones_like(pose[:, 0]), xp.zeros_like(pose[:, 0], dtype=xp.int64)
+        return State(pose, xp.zeros_like(pose), one, one * xp.inf, count, reference.K[:, 0])
+
+    def convert(self, function: Callable[[Any], Any]) -> State:
+        """The state in the other library, by ``Tensor.numpy`` or ``torch.from_numpy``."""
+        return State._make([*map(function, self[:-1]), self.patch])
 
     def select(self, index: Tensor) -> State:
         """The state of some of the templates."""
@@ -140,40 +146,35 @@ def secant(state: State, delta: Any, length: Any) -> tuple[Any, Any]:
     return xp.where(usable, (state.factor / (1 - along)).clip(1.0, LARGEST_STRETCH), 1.0), rate
 
 
-@np.errstate(all="ignore")
 def iterate(reference: Reference, sample: Sampler, state: State, tolerance: float, budget: int) -> State:
     """Gauss-Newton until every predicted error is below ``tolerance`` or ``budget`` iterations are spent.
 
-    An accelerator does them all, so that the host need not know: what has converged is masked. A CPU stops when it can,
-    and leaves the algebra of poses to numpy, a call of which takes it a third of the time of torch's.
+    An accelerator does them all, so that the host need not know: what has converged is masked.
     """
     state = state._replace(patch=torch.zeros_like(reference.K[:, 0]))
-    if not host_looks(reference.K.device):
-        for _ in range(budget):
-            state = gauss_newton(reference, sample, state, tolerance)
-        return state
-    state = State._make([*(v.numpy() for v in state[:-1]), state.patch])
-    while budget and (state.error > tolerance).any():
-        state, budget = gauss_newton(reference, sample, state, tolerance), budget - 1
-    return State._make([*map(torch.from_numpy, state[:-1]), state.patch])
+    for _ in range(budget):
+        if host_looks(reference.K.device) and not (state.error > tolerance).any():
+            break
+        state = gauss_newton(reference, sample, state, tolerance)
+    return state
 
 
-def refine(
-    reference: Reference, image: Tensor, state: State, settings: Settings, *, border: bool
-) -> tuple[State, Tensor]:
+@np.errstate(all="ignore")
+def refine(reference: Reference, image: Tensor, state: State, settings: Settings, *, border: bool) -> tuple[State, Any]:
     """From a start within the basin to the answer: bilinear and few pixels first, then all that is asked for.
 
     And which templates (B,) are settled: all with ``border``; without it no pixel may drop out of sight, and those
     that come near the border are left alone.
     """
-    size, settled = (image.shape[-2], image.shape[-1]), torch.ones_like(state.pose[:, 0], dtype=torch.bool)
+    size, xp = (image.shape[-2], image.shape[-1]), library(state.pose)
+    settled = xp.ones_like(state.pose[:, 0]) > 0
     for part, interpolation, tolerance, budget in stages(reference, settings):
         if border:
             state = stage(part, image, state, interpolation, tolerance, budget)
             continue
         warp = warps(reference, state.pose)
         settled = settled & inside(warp, reference.box, size, margin=EDGE).all(-1)
-        state = state._replace(error=torch.where(settled, torch.inf, 0.0).to(state.pose.dtype))
+        state = state._replace(error=xp.where(settled, xp.inf, 0.0))
         state = iterate(part, make_sampler(interpolation, image, warp, reference.box), state, tolerance, budget)
     if not border:
         settled = settled & inside(warps(reference, state.pose), reference.box, size).all(-1)
@@ -183,26 +184,29 @@ def refine(
 def stages(reference: Reference, settings: Settings) -> list[tuple[Reference, str, float, int]]:
     """What to do one after the other: the pixels, the sampler, the tolerance in px and the iterations at most."""
     thin, budget = reference.thin, settings.max_iterations
-    last = (reference, settings.interpolation, settings.tolerance, budget)
     if budget == 1 or (settings.interpolation == "bilinear" and thin is reference):
-        return [last]
+        return [(reference, settings.interpolation, settings.tolerance, budget)]
     coarse = max(budget * 2 // 3, 1)
-    first = (thin, "bilinear", max(settings.tolerance, COARSE_TOLERANCE), coarse)
-    return [first, (*last[:3], budget - coarse)]
+    return [
+        (thin, "bilinear", max(settings.tolerance, COARSE_TOLERANCE), coarse),
+        (reference, settings.interpolation, settings.tolerance, budget - coarse),
+    ]
 
 
+@np.errstate(all="ignore")
 def stage(
     reference: Reference, image: Tensor, state: State, interpolation: str, tolerance: float, budget: int
 ) -> State:
     """``iterate`` with one sampler; templates that reach beyond the frame are weighed anew at every iteration."""
-    state = state._replace(error=torch.full_like(state.error, torch.inf))
+    state = state._replace(error=torch.full_like(state.error, torch.inf), patch=torch.zeros_like(reference.K[:, 0]))
     warp, size = warps(reference, state.pose), (image.shape[-2], image.shape[-1])
     sample = make_sampler(interpolation, image, warp, reference.box)
     whole = inside(warp, reference.box, size, margin=EDGE).all(-1)
     for index, edge in ((whole, None), (~whole, size)):
         some = index.nonzero()[:, 0]
         if len(some):
+            begin = state.select(some).convert(Tensor.numpy if host_looks(some.device) else Tensor.clone)
             part = sample._replace(edge=edge).select(some)
-            found = iterate(reference.select(some), part, state.select(some), tolerance, budget)
-            state = state._replace(patch=torch.zeros_like(reference.K[:, 0])).merge(some, found)
+            found = iterate(reference.select(some), part, begin, tolerance, budget)
+            state = state.merge(some, found.convert(torch.as_tensor))
     return state

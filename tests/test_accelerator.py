@@ -1,0 +1,109 @@
+"""A solve on an accelerator never waits for the host: nothing in it depends on a value, so that a graph can hold it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torch_ecc import align, prepare, sampling
+from torch_ecc.align import UNSETTLED, solve_in_torch
+from torch_ecc.estimate import Status
+from torch_ecc.sim.scene import PlaneWaves
+from torch_ecc.solver import Settings, State, refine
+
+SCENE = PlaneWaves.random(seed=1)
+FRAME = (150, 170)
+WAITS = {"_local_scalar_dense", "item", "nonzero", "masked_select", "unique", "_unique2", "is_nonzero", "equal"}
+
+
+class NoWaiting(TorchDispatchMode):
+    """Refuses what copies a value to the host or gives a tensor whose size depends on values."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.__name__.split(".")[0]
+        masks = [x for a in args if isinstance(a, (list, tuple)) for x in a if isinstance(x, torch.Tensor)]
+        by_mask = name in ("index", "index_put", "index_put_") and any(m.dtype == torch.bool for m in masks)
+        if name in WAITS or by_mask:
+            raise AssertionError(f"an accelerator would wait for the host in {func}")
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture
+def blind(monkeypatch):
+    """The host looks at nothing, as on an accelerator."""
+    monkeypatch.setattr(sampling, "LOOKED_AT", set())
+
+
+def problem(seed: int, count: int = 6):
+    """Templates of one scene with noise, a frame of it for each, and starts up to 2 px and 0.02 rad off; the last
+    template crosses the frame's border, the one before it sees another scene."""
+    generator = torch.Generator().manual_seed(seed)
+    still = torch.tensor([[30.0, 25.0, 0.0]], dtype=torch.float64).expand(count, 3)
+    places = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    truth = torch.tensor([60.0, 60.0, -3.0]) + places * torch.tensor([50.0, 30.0, 6.0])
+    truth[-1, 0] = 20.0
+    images = SCENE.render(truth, FRAME)
+    images[-2] = PlaneWaves.random(seed=9).render(truth[:1], FRAME)[0]
+    templates = SCENE.render(still, (51, 61)) + torch.randn(count, 1, 51, 61, generator=generator)
+    images = images + torch.randn(images.shape, generator=generator)
+    off = 4 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 2
+    return templates, images.round().clamp(0, 255).to(torch.uint8), truth + off * torch.tensor([1.0, 1.0, 0.01])
+
+
+@pytest.mark.parametrize("criterion", ["ecc", "ecc_paper", "ssd"])
+@pytest.mark.parametrize("interpolation", ["bilinear", "bspline3", "bspline5"])
+def test_nothing_waits_for_the_host(blind, criterion, interpolation):
+    templates, images, start = problem(0)
+    reference = prepare(templates, criterion=criterion)
+    with NoWaiting():
+        found = solve_in_torch(reference, images, start, Settings(interpolation))
+    assert found.status.tolist()[-2:] == [Status.LOST, UNSETTLED]
+
+
+@pytest.mark.parametrize("size", [61, 150])
+@pytest.mark.parametrize("interpolation", ["bilinear", "bspline3"])
+def test_it_gives_what_a_cpu_gives(monkeypatch, interpolation, size):
+    """With few pixels first (150) and without."""
+    templates, images, start = problem(1)
+    if size > 61:
+        templates, images = (torch.nn.functional.interpolate(v.float(), scale_factor=3) for v in (templates, images))
+        start = start * torch.tensor([3.0, 3.0, 1.0]) + torch.tensor([1.0, 1.0, 0.0])
+    reference = prepare(templates)
+    assert (reference.thin is reference) == (size == 61)
+    looking = align(reference, images, start, interpolation=interpolation, backend="torch")
+    monkeypatch.setattr(sampling, "LOOKED_AT", set())
+    never = align(reference, images, start, interpolation=interpolation, backend="torch")
+    assert torch.equal(never.status, looking.status)
+    assert torch.equal(never.iterations, looking.iterations)
+    assert (never.pose - looking.pose).abs().max() < 1e-4
+    torch.testing.assert_close(never.sigma, looking.sigma, rtol=3e-2, atol=0)  # one looks at the patch once more
+
+
+def test_one_graph_serves_all_frames(blind):
+    """Operations recorded on one frame and replayed on another give that frame's poses."""
+    templates, images, start = problem(2)
+    reference, settings = prepare(templates), Settings(max_iterations=8)
+
+    def pose_and_status(image, pose):
+        found = solve_in_torch(reference, image, pose, settings)
+        return found.pose, found.status
+
+    graph = make_fx(pose_and_status)(images, start)
+    _, others, begin = problem(3)
+    for replayed, direct in zip(graph(others, begin), pose_and_status(others, begin), strict=True):
+        assert torch.equal(replayed, direct)
+    assert not torch.equal(graph(others, begin)[0], pose_and_status(images, start)[0])
+
+
+def test_templates_far_from_the_border_are_settled_and_others_left_alone():
+    """On any device; those at the border keep their start until the slower way has them."""
+    templates, images, start = problem(4)
+    state, settled = refine(
+        prepare(templates), images, State.start(prepare(templates), start), Settings(), border=False
+    )
+    assert settled.tolist() == [True] * 5 + [False]
+    assert torch.equal(state.pose[-1], start[-1])
+    assert state.iterations[-1] == 0
+    assert (align(prepare(templates), images, start).status != UNSETTLED).all()
