@@ -15,6 +15,7 @@ from torch_ecc.reference import Reference
 from torch_ecc.sampling import host_looks
 from torch_ecc.solver import Settings, State, refine
 
+PIXELS_AT_ONCE = 2**18  # of templates, per thread
 UNSETTLED = -1  # the status of a template at the frame's border, which takes another way
 
 
@@ -76,9 +77,23 @@ def solve_in_torch(
 ) -> Estimate:
     """``solve`` on any device, with any criterion: what the native path is measured against.
 
-    Without ``border`` templates that come near it are not settled: status -1. No device but the CPU is then stopped
-    for the host to look at a value, so that a CUDA graph can hold all of it.
+    Without ``border`` templates that come near it are not settled: status UNSETTLED. A CPU does some templates after
+    the other, in its cache. Any other device is not stopped for the host to look at a value, so that a CUDA graph can
+    hold all of this.
     """
+    image = image.float()
+    if border or not host_looks(pose.device):
+        return _solve_at_once(reference, image, pose, settings, border)
+    some = max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1)
+    parts = []
+    for k in range(0, len(pose), some):
+        those = slice(k, k + some)
+        view = image if len(image) == 1 else image[those]
+        parts.append(_solve_at_once(reference.select(those), view, pose[those], settings, border))
+    return Estimate(*map(torch.cat, zip(*parts, strict=True))) if len(parts) > 1 else parts[0]
+
+
+def _solve_at_once(reference: Reference, image: Tensor, pose: Tensor, settings: Settings, border: bool) -> Estimate:
     start: Any = pose.numpy() if host_looks(pose.device) and not border else pose
     state, settled = refine(reference, image, State.start(reference, start), settings, border=border)
     estimate = judge(reference, state, start, settings, (image.shape[-2], image.shape[-1]) if border else None)

@@ -45,17 +45,16 @@ def judge(
     if size is not None:
         reference = reweigh(reference, inside(torch.as_tensor(warps(reference, pose)), reference.pixels, size))
     sums = Sums(*(alike(value, pose) for value in add_up(reference, state.patch, settings.min_score)))
-    reference, whole = (
-        r._replace(**{name: alike(getattr(r, name), pose) for name in FIGURES}) for r in (reference, whole)
-    )
+    reference = reference._replace(**{name: alike(getattr(reference, name), pose) for name in FIGURES})
     gain, power = (xp.where(abs(v) < xp.inf, v, 0.0) for v in (sums.gain, sums.power))
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
     structure = clustering(reference, sums.blocks, noise * (1 + gain * gain))
     sampler = interpolation_error(reference, pose, settings.interpolation)
     covariance, fixed = pose_covariance(reference, noise, gain, pose, structure, sampler)
-    shown = reference.moments[:, 1] >= settings.min_visible * whole.moments[:, 1]
+    shown = reference.moments[:, 1] >= settings.min_visible * alike(whole.moments, pose)[:, 1]
     match = (sums.alike >= settings.min_score) & (gain > 0) & (abs(pose) < xp.inf).all(-1)
-    status = decide(whole, shown, match, fixed, state.error <= settings.tolerance)
+    empty = alike(whole.noise, pose) ** 2 * alike(whole.noise_share, pose) > DOUBTFUL_SHARE
+    status = decide(shown, match, fixed, state.error <= settings.tolerance, empty)
     good = Status.good(status)
     pose = xp.where(good[:, None], pose, start)
     diagonal = alike(torch.eye(3, device=state.patch.device), start) > 0
@@ -64,16 +63,15 @@ def judge(
     return Estimate(*map(torch.as_tensor, fields))
 
 
-def decide(reference: Reference, shown: Any, match: Any, fixed: Any, converged: Any) -> Any:
+def decide(shown: Any, match: Any, fixed: Any, converged: Any, empty: Any) -> Any:
     """Status codes (B,) int8 from what was found, (B,) bool each: enough of it is ``shown``, it is a ``match``, its
-    texture has ``fixed`` the pose, the iterations have ``converged``."""
+    texture has ``fixed`` the pose, the iterations have ``converged``, it is ``empty`` of any texture of its own."""
     xp = library(shown)
     status = xp.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
     status = xp.where(fixed, status, int(Status.LOW_TEXTURE))
     status = xp.where(match, status, int(Status.LOST))
     status = xp.where(shown, status, int(Status.OUT_OF_VIEW))
-    empty = reference.noise**2 * reference.noise_share > DOUBTFUL_SHARE
-    status = xp.where(empty & ~(match & shown), int(Status.LOW_TEXTURE), status)  # without texture: that is why
+    status = xp.where(empty & ~(match & shown), int(Status.LOW_TEXTURE), status)  # that is why
     return xp.asarray(status, dtype=xp.int8)
 
 

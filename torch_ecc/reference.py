@@ -105,9 +105,9 @@ class Reference(NamedTuple):
             return self
         return self._replace(**{name: getattr(self, f"{name}_sparse") for name in ("K", *PIXELWISE)})
 
-    def select(self, index: Tensor) -> Reference:
-        """The reference of the templates at ``index`` (n,)."""
-        if len(index) == len(self.K):
+    def select(self, index: Tensor | slice) -> Reference:
+        """The reference of the templates at ``index`` (n,); of a slice without a copy."""
+        if isinstance(index, Tensor) and len(index) == len(self.K):
             return self
         shared = SHARED if len(self.weight) > 1 else (*SHARED, "weight", "weight_sparse")
         return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))

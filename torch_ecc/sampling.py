@@ -56,6 +56,13 @@ class BSpline(NamedTuple):
     degree: int
     edge: tuple[int, int] | None = None
 
+    @staticmethod
+    def of(image: Tensor, degree: int, corner: Tensor | None = None) -> BSpline:
+        """Of an ``image`` (I, 1, h, w) whose pixel (0, 0) lies at ``corner`` (I, 2), by default the origin."""
+        ring = degree // 2
+        corner = torch.zeros(1, 2, device=image.device) if corner is None else corner
+        return BSpline(prefilter(image, degree, ring), corner - ring, degree)
+
     def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
         """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N).
 
@@ -65,18 +72,17 @@ class BSpline(NamedTuple):
         local = torch.cat((warp[:, :, :2], warp[:, :, 2:] - self.origin[:, :, None]), -1)
         points = local.to(pixels.dtype) @ pixels
         scale, shift = _unit_square(*self.coefficients.shape[-2:], points.dtype, points.device)
-        floor = points.floor()
-        first, total, second = zip(*_pairs(points - floor, self.degree), strict=True)
-        pairs = len(first)
-        at = torch.stack([floor + (b / a + k) for k, a, b in zip(first, total, second, strict=True)], 1)
-        at = torch.addcmul(shift[:, 2:], at, scale)  # (B, pairs, 2, N): where each pair of taps is looked up
-        grid = torch.stack(
-            (at[:, None, :, 0].expand(-1, pairs, -1, -1), at[:, :, None, 1].expand(-1, -1, pairs, -1)), -1
-        )
-        # The coefficients mirror at the border, as the prefilter has assumed.
-        values = _lookup(self.coefficients, grid.flatten(1, 2), "reflection").unflatten(1, (pairs, pairs))
-        wx, wy = torch.stack(total, 1).unbind(2)
-        value: Tensor = ((values * wx[:, None]).sum(2) * wy).sum(1)
+        floor, value = points.floor(), torch.zeros_like(points[:, 0])
+        pairs = []  # per pair of taps: total weight and normalised coordinate of their lookup, both (B, 2, N)
+        for first, total, second in _pairs(points - floor, self.degree):
+            at = torch.div(second, total).add_(floor).add_(first)
+            pairs.append((total, torch.addcmul(shift[:, 2:], at, scale)))
+        for wy, y in pairs:
+            row = torch.zeros_like(value)
+            for wx, x in pairs:
+                look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), -1)[:, None])
+                row.addcmul_(look[:, 0], wx[:, 0])
+            value.addcmul_(row, wy[:, 1])
         return value
 
     def select(self, index: Tensor) -> BSpline:
@@ -110,12 +116,12 @@ def make_sampler(interpolation: str, image: Tensor, warp: Any, box: Tensor) -> S
         corners = np.asarray(warp) @ np.asarray(box)
         low = np.floor(corners.min(-1)) - REACH
         extent = int((np.ceil(corners.max(-1)) + REACH - low).max()) + 1
-        side = -(-extent // 16) * 16  # few different sizes, so that the prefilter matrices are reused
+        side = -(-extent // 8) * 8  # few different sizes, so that the prefilter matrices are reused
         shared = len(image) == 1 and len(warp) * 2 * side**3 >= h * w * (h + w)
         if not shared and side <= min(h, w):
             low = np.clip(low, 0, (w - side, h - side)).astype(int)  # what lies beyond is not sampled
-            return BSpline(prefilter(_crop(image, low, side), degree), torch.from_numpy(low), degree)
-    return BSpline(prefilter(image.float(), degree), torch.zeros(1, 2, device=image.device), degree)
+            return BSpline.of(_crop(image, low, side), degree, torch.from_numpy(low))
+    return BSpline.of(image.float(), degree)
 
 
 def inside(warp: Any, pixels: Tensor, size: tuple[int, int], margin: float = 0.0) -> Any:
@@ -145,10 +151,10 @@ def _unit_square(h: int, w: int, dtype: torch.dtype, device: torch.device) -> tu
     return scale, torch.tensor([[0, 0, -1.0]] * 2, dtype=dtype, device=device)
 
 
-def _lookup(image: Tensor, grid: Tensor, beyond: str = "border") -> Tensor:
+def _lookup(image: Tensor, grid: Tensor) -> Tensor:
     """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, M, N, 2): (B, M, N)."""
     image = image.expand(len(grid), -1, -1, -1)
-    return F.grid_sample(image, grid, mode="bilinear", padding_mode=beyond, align_corners=True)[:, 0]
+    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[:, 0]
 
 
 def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
@@ -158,8 +164,8 @@ def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
     if degree == 1:
         return [(0, torch.ones_like(f), f)]
     if degree == 3:
-        left, right = r**3 / 6, f**3 / 6
-        high = torch.addcmul(2 / 3 + 3 * left, r, r, value=-1) + right
+        left, right = (r * r).mul_(r).div_(6), (f * f).mul_(f).div_(6)
+        high = torch.rsub(f, 0.5, alpha=1 / 3).mul_(f).add_(0.5).mul_(f).add_(1 / 6)
         low = 1 - high
         return [(-1, low, low - left), (1, high, right)]
     w = [
@@ -186,14 +192,20 @@ def _spline_matrices(n: int, degree: int, device: torch.device) -> tuple[Tensor,
     return filter_.float().to(device), (slope @ filter_).float().to(device)
 
 
-def prefilter(image: Tensor, degree: int) -> Tensor:
-    """Coefficients of the interpolating B-spline of ``image`` (..., H, W), mirrored at its border (Unser, 1993).
+def prefilter(image: Tensor, degree: int, ring: int = 0) -> Tensor:
+    """Coefficients of the interpolating B-spline of ``image`` (..., H, W), mirrored at its border (Unser, 1993), and
+    ``ring`` more on every side, which repeat those inside: (..., H + 2 ring, W + 2 ring).
 
-    Two products with a dense inverse: exact, and faster than a recursion or a 25-tap convolution in torch.
+    Two products with a dense inverse: exact, and faster than a recursion, blocks or a 25-tap convolution in torch.
     """
-    rows, _ = _spline_matrices(image.shape[-2], degree, image.device)
-    columns, _ = _spline_matrices(image.shape[-1], degree, image.device)
+    rows, columns = (_prefilter_matrix(n, degree, ring, image.device) for n in image.shape[-2:])
     return rows @ image @ columns.mT
+
+
+@lru_cache(maxsize=64)
+def _prefilter_matrix(n: int, degree: int, ring: int, device: torch.device) -> Tensor:
+    index = _mirror(torch.arange(-ring, n + ring, device=device), n)
+    return _spline_matrices(n, degree, device)[0][index]
 
 
 def gradients(image: Tensor) -> Tensor:
