@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from torch_ecc import ECC, SSD, PaperECC, prepare
 from torch_ecc.pose import transform
-from torch_ecc.reference import reweigh
+from torch_ecc.reference import Reference, reweigh
 from torch_ecc.sim.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=3)
@@ -191,3 +191,17 @@ def test_the_sparse_pixels_alone_are_a_template(criterion):
 def test_a_small_template_keeps_all_pixels():
     reference = prepare(analytic_template(61, 61))
     assert reference.thin is reference
+
+
+@pytest.mark.parametrize("some", [1, 2, 3])
+@pytest.mark.parametrize("masked", [False, True])
+def test_many_templates_are_prepared_in_portions(monkeypatch, masked, some):
+    """As all at once, whatever the size of a portion."""
+    generator = torch.Generator().manual_seed(0)
+    templates = analytic_template(121, 131).float() + torch.randn(5, 1, 121, 131, generator=generator)
+    mask = torch.rand(5, 121, 131, generator=generator) > 0.1 if masked else None
+    together = prepare(templates, mask=mask)
+    monkeypatch.setattr("torch_ecc.reference.PIXELS_AT_ONCE", some * 121 * 131)
+    portions = prepare(templates, mask=mask)
+    for name, whole, part in zip(Reference._fields[1:], together[1:], portions[1:], strict=True):
+        torch.testing.assert_close(part, whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max()), msg=name)

@@ -16,7 +16,8 @@ approximation that serves while the motion between frames is small; with eq. 10 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import chain, repeat
 from typing import NamedTuple
 
 import torch
@@ -33,6 +34,7 @@ MARGIN = 8  # px that a template is continued by before it is differentiated and
 ENOUGH = 3000  # pixels of a template tell well where to go; the first iterations leave out others in x and y
 SPARSEST = 4  # px between those that are kept
 BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
+PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which takes some 600 bytes on the way
 SMALLEST = 5  # px: side of the smallest template
 PIXELWISE = ("pixels", "signal", "instrument", "trust", "weight")  # beside K; what the sparse pixels have too
 SHARED = ("criterion", "pixels", "box", "block", "block_sizes", "sparse", "pixels_sparse")  # by all templates
@@ -109,12 +111,17 @@ class Reference(NamedTuple):
         """The reference of the templates at ``index`` (n,); of a slice without a copy."""
         if isinstance(index, Tensor) and len(index) == len(self.K):
             return self
-        shared = SHARED if len(self.weight) > 1 else (*SHARED, "weight", "weight_sparse")
+        shared = _shared(len(self.weight))
         return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
         """``function`` applied to every tensor, ``lambda t: t.to(device)`` for instance."""
         return Reference(self.criterion, *(function(v) for v in self[1:]))
+
+
+def _shared(weights: int) -> tuple[str, ...]:
+    """The names of the fields that all templates have in common; the weights too if there is but one set of them."""
+    return SHARED if weights > 1 else (*SHARED, "weight", "weight_sparse")
 
 
 @torch.no_grad()
@@ -139,16 +146,37 @@ def prepare(
         raise ValueError(f"prepare: template must be at least {SMALLEST}x{SMALLEST} px, got {size[0]}x{size[1]}")
     kept = gray.new_ones(1, 1, *size) if mask is None else as_mask("prepare", mask, len(gray), size).to(gray.device)
     _refuse_flat(gray, kept)
+    centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre).to(gray)
+    if centre.shape != (len(gray), 2):
+        raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
+    some, used = max(PIXELS_AT_ONCE // gray[0].numel(), 1), (kept > 0).any(0).flatten()
+    parts = zip(gray.split(some), kept.split(some) if len(kept) > 1 else repeat(kept), centre.split(some), strict=False)
+    return _joined((_prepared(chosen, *part, used) for part in parts), len(gray), _shared(len(kept)))
+
+
+def _joined(parts: Iterator[Reference], count: int, shared: tuple[str, ...]) -> Reference:
+    """One reference of ``count`` templates from those of some after the other, of which never more than one is there;
+    the names of the fields that they have in common."""
+    first, done = next(parts), 0
+    if len(first.K) == count:
+        return first
+    own = {name: v.new_empty(count, *v.shape[1:]) for name, v in first._asdict().items() if name not in shared}
+    for part in chain([first], parts):
+        for name, values in own.items():
+            values[done : done + len(part.K)] = getattr(part, name)
+        done += len(part.K)
+    return first._replace(**own)
+
+
+def _prepared(criterion: Criterion, gray: Tensor, kept: Tensor, centre: Tensor, used: Tensor) -> Reference:
+    """``prepare`` of grey templates (B, 1, h, w) with weights (1 or B, 1, h, w), of which the pixels ``used`` (h w,)
+    count in any template, about ``centre`` (B, 2)."""
     wide = pad(gray, MARGIN)
     inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
     soft, noise = blur(wide, INSTRUMENT_BLUR), template_noise(gray, kept)
     slopes = gradients(soft)
     images = torch.cat((gradients(wide), wide, slopes, soft, texture_share(slopes, noise)), 1)[inner]
-    centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre).to(gray)
-    if centre.shape != (len(gray), 2):
-        raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
-    reference = _assemble(chosen, images, noise, kept, centre)
-    used = (kept > 0).any(0).flatten()
+    reference = _assemble(criterion, images, noise, kept, centre, used)
     wrong = torch.cat([aliasing(wide, name) for name in ALIASING], 1)[inner].flatten(2)[:, :, used]
     wrong = wrong.unflatten(1, (len(ALIASING), 2))
     return reference._replace(alias=(reference.K[:, None, :3] @ wrong.mT).to(reference.radius.dtype))
@@ -163,11 +191,12 @@ def _refuse_flat(gray: Tensor, kept: Tensor) -> None:
         raise ValueError(f"prepare: template must have texture, got one single grey level in template {flat}")
 
 
-def _assemble(criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor, centre: Tensor) -> Reference:
+def _assemble(
+    criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor, centre: Tensor, used: Tensor
+) -> Reference:
     """Reference from ``images`` (B, 7, h, w): d/dx, d/dy and t, the same blurred, and what of the blurred slopes is
     texture; the template's ``noise`` (B,) and weights (1 or B, 1, h, w)."""
     h, w = images.shape[-2:]
-    used = (kept > 0).any(0).flatten()
     y, x = torch.meshgrid(*(torch.arange(n, device=images.device) - (n - 1) / 2 for n in (h, w)), indexing="ij")
     pixels = torch.stack((x.flatten()[used], y.flatten()[used], torch.ones_like(x.flatten()[used])))
     (left, top), (right, bottom) = pixels[:2].amin(-1).tolist(), pixels[:2].amax(-1).tolist()
@@ -177,7 +206,7 @@ def _assemble(criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor,
     sharp, soft, trust = images.flatten(2)[:, :, used].split((3, 3, 1), 1)
     signal, instrument = _steepest_descent(sharp, local), _steepest_descent(soft, local)
     instrument = torch.cat((instrument[:, :3] * trust, instrument[:, 3:]), 1)
-    radius = (local.norm(dim=1) * (weight > 0)).amax(-1).to(pose_dtype(images.device))
+    radius = (local.square().sum(1) * (weight > 0)).amax(-1).sqrt().to(pose_dtype(images.device))
     nothing, no_alias = radius.new_zeros(len(images), 3, 3), radius.new_zeros(len(images), len(ALIASING), 3, 2)
     column, row = ((pixels[:2] - box[:2, :1]) / BLOCK).long()
     _, block, block_sizes = torch.unique(row * w + column, return_inverse=True, return_counts=True)
@@ -198,11 +227,12 @@ def _assemble(criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor,
     column, row = (pixels[:2] - box[:2, :1]).long()
     step = min(max(math.isqrt(pixels.shape[1] // ENOUGH), 1), SPARSEST)
     sparse = ((column % step == 0) & (row % step == 0)).nonzero()[:, 0]
-    few = [v[..., sparse] for v in (signal, pixels, signal, instrument, trust[:, 0], weight)]
-    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, *few, radius)
-    reference = Reference(criterion, *constants, *rest)
-    thin = reweigh(reference.thin, few[-1] > 0)
-    return reweigh(reference._replace(K_sparse=thin.K), weight > 0)
+    kept_here = sparse if step > 1 else sparse[:0]  # all of them are the template itself
+    few = [v[..., kept_here] for v in (pixels, signal, instrument, trust[:, 0], weight)]
+    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, signal, *few, radius)
+    reference = reweigh(Reference(criterion, *constants, *rest), weight > 0)
+    thin = reference.thin
+    return reference._replace(K_sparse=reference.K if thin is reference else reweigh(thin, thin.weight > 0).K)
 
 
 def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ class Bilinear(NamedTuple):
         """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside the image its border repeats."""
         scale, shift = _unit_square(*self.image.shape[-2:], warp.dtype, warp.device)
         points = torch.addcmul(shift, warp, scale).to(pixels.dtype) @ pixels
-        return _lookup(self.image, points.mT[:, None])[:, 0]
+        return _lookup(self.image, points)
 
     def select(self, index: Tensor) -> Bilinear:
         """The sampler of some of the templates."""
@@ -80,8 +80,8 @@ class BSpline(NamedTuple):
         for wy, y in pairs:
             row = torch.zeros_like(value)
             for wx, x in pairs:
-                look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), -1)[:, None])
-                row.addcmul_(look[:, 0], wx[:, 0])
+                look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), 1))
+                row.addcmul_(look, wx[:, 0])
             value.addcmul_(row, wy[:, 1])
         return value
 
@@ -151,10 +151,10 @@ def _unit_square(h: int, w: int, dtype: torch.dtype, device: torch.device) -> tu
     return scale, torch.tensor([[0, 0, -1.0]] * 2, dtype=dtype, device=device)
 
 
-def _lookup(image: Tensor, grid: Tensor) -> Tensor:
-    """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, M, N, 2): (B, M, N)."""
-    image = image.expand(len(grid), -1, -1, -1)
-    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[:, 0]
+def _lookup(image: Tensor, points: Tensor) -> Tensor:
+    """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, 2, N): (B, N). Its border repeats."""
+    image, grid = image.expand(len(points), -1, -1, -1), points.mT[:, None]
+    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[:, 0, 0]
 
 
 def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
