@@ -1,0 +1,144 @@
+"""Thousands of templates on one device, beside the rate at which it copies: python benchmarks/accelerator.py --device cuda
+
+Every iteration has to read of each pixel 4 rows of K and the frame's value, 20 bytes; so many times the pixels and the
+iterations over the measured rate of a copy is the roofline, of which the share reached is printed. The solve is the one
+of an accelerator on any device: all iterations, no look of the host at a value; a CUDA device replays it as a graph.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import torch
+from results import Figure, save
+from rich.console import Console
+from scaling import SCENE, spread
+from torch import Tensor
+
+from torch_ecc import Estimate, Tracker, sampling
+from torch_ecc.align import solve_in_torch
+from torch_ecc.experiments.accuracy import Harmonic
+from torch_ecc.reference import Reference
+from torch_ecc.sim import Camera, Sequence
+from torch_ecc.solver import Settings, stages
+
+FRAME = (480, 640)
+BYTES = 4 * (4 + 1)  # per pixel and iteration: float32 of the rows of K that the step needs, and of the frame
+CHECKED = 16  # templates that are solved on the CPU too
+console = Console(width=110)
+Solve = Callable[[Tensor, Tensor], Estimate]
+
+
+def wait(device: torch.device) -> None:
+    """Until the device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def seconds(device: torch.device, work: Callable[[], object], times: int) -> float:
+    """Of one call, on average over ``times`` after a first one."""
+    work()
+    wait(device)
+    start = time.perf_counter()
+    for _ in range(times):
+        work()
+    wait(device)
+    return (time.perf_counter() - start) / times
+
+
+def copy_rate(device: torch.device) -> float:
+    """Bytes per second, read and written, of a copy too large for any cache: 256 MB, on a CPU 64 MB."""
+    source = torch.zeros(2**26 if device.type == "cuda" else 2**24, device=device)
+    target = torch.empty_like(source)
+    return 2 * source.numel() * source.element_size() / seconds(device, lambda: target.copy_(source), 10)
+
+
+def captured(solve: Solve, image: Tensor, pose: Tensor) -> Solve:
+    """``solve`` as a CUDA graph, replayed with the data of each call; on another device as it is."""
+    if image.device.type != "cuda":
+        return solve
+    inputs = image.clone(), pose.clone()
+    stream = torch.cuda.Stream(image.device)
+    stream.wait_stream(torch.cuda.current_stream(image.device))
+    with torch.cuda.stream(stream):  # constants are made, libraries loaded
+        for _ in range(3):
+            solve(*inputs)
+    torch.cuda.current_stream(image.device).wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        result = solve(*inputs)
+
+    def replay(image: Tensor, pose: Tensor) -> Estimate:
+        for held, new in zip(inputs, (image, pose), strict=True):
+            held.copy_(new)
+        graph.replay()
+        return result
+
+    return replay
+
+
+def visited(reference: Reference, settings: Settings) -> int:
+    """Pixels that one pose takes, each as often as there are iterations on it."""
+    return sum(part.K.shape[-1] * budget for part, _, _, budget in stages(reference, settings))
+
+
+@torch.no_grad()
+@click.command()
+@click.option("--device", default="cuda" if torch.cuda.is_available() else "cpu", show_default=True)
+@click.option("--count", type=int, help="templates in a frame [default: 4096, on a CPU 16]")
+@click.option("--frames", default=10, show_default=True)
+@click.option("--size", default=121, show_default=True, help="px")
+@click.option("--iterations", default=8, show_default=True)
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
+def main(device: str, count: int | None, frames: int, size: int, iterations: int, out: Path | None) -> None:
+    """Poses per second, share of the roofline, agreement with the CPU, by sampler."""
+    place = torch.device(device)
+    count = count or (4096 if place.type == "cuda" else 16)
+    views = list(Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).path(Camera()), Camera()))
+    centers = spread(count, size + 40, FRAME).round()
+    tracker = Tracker(views[0], centers, size, device=place, backend="torch")
+    reference, start = tracker.references[0], tracker.pose
+    some = torch.arange(min(CHECKED, count))
+    near = reference.map(lambda tensor: tensor.cpu()).select(some)
+    on_device, rate = [view[None].to(place) for view in views[1:]], copy_rate(place)
+    console.print(f"{place}: copies {rate / 1e9:.1f} GB/s; {count} templates of {size} px in each of {frames} frames")
+    figures = [Figure("copy rate", rate / 1e9, "GB/s", "higher")]
+    for sampler in ("bilinear", "bspline3"):
+        settings = Settings(sampler, iterations, backend="torch")
+        expected, looked_at = [], sampling.LOOKED_AT.copy()
+        pose = start[some.to(place)].cpu()
+        for view in views[1:]:
+            expected.append(pose := solve_in_torch(near, view[None], pose, settings).pose)
+        try:
+            sampling.LOOKED_AT.clear()
+            solve = captured(lambda i, p, s=settings: solve_in_torch(reference, i, p, s), on_device[0], start)
+
+            def sweep(solve: Solve = solve) -> list[Tensor]:
+                poses = [start]
+                for image in on_device:
+                    poses.append(solve(image, poses[-1]).pose.clone())
+                return poses[1:]
+
+            poses_per_s = count * frames / seconds(place, sweep, 3)
+            apart = max(float((a[some.to(place)].cpu() - b).abs().max()) for a, b in zip(sweep(), expected, strict=True))
+        finally:
+            sampling.LOOKED_AT.update(looked_at)
+        share = poses_per_s * visited(reference, settings) * BYTES / rate
+        console.print(
+            f"{sampler}: {poses_per_s:,.0f} poses/s, {visited(reference, settings) * BYTES / iterations / 1e3:.0f} kB per "
+            f"template and iteration, {share:.1%} of the roofline, {apart:.1e} px or rad from the CPU's poses"
+        )
+        figures += [
+            Figure(f"{sampler}: poses", poses_per_s, "1/s", "higher", 0.3),
+            Figure(f"{sampler}: share of the roofline", share, "", "higher", 0.3),
+            Figure(f"{sampler}: from the CPU's poses", apart, "px", "lower"),
+        ]
+    if out:
+        save(out, figures, device=str(place), count=str(count), size=str(size), iterations=str(iterations))
+
+
+if __name__ == "__main__":
+    main()
