@@ -39,7 +39,8 @@ def judge(
 ) -> Estimate:
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back.
 
-    ``size`` (h, w) of the frame: only pixels inside it count. None if all are known to be.
+    ``size`` (h, w) of the frame: only pixels inside it count. None if all are known to be. ``start`` and the state are
+    tensors or, on a CPU, numpy arrays.
     """
     pose, whole, xp = state.pose, reference, library(state.pose)
     if size is not None:

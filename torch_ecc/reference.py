@@ -89,12 +89,6 @@ class Reference(NamedTuple):
     moments: Tensor
 
     @property
-    def lever(self) -> Tensor:
-        """What turns an increment into px at the farthest pixel, (B, 3)."""
-        one = torch.ones_like(self.radius)
-        return torch.stack((one, one, self.radius), -1)
-
-    @property
     def uv(self) -> Tensor:
         """Pixel positions about the centre over half the bounding box, (B, 2, N): the light columns' coordinates."""
         half = (self.box[:2, 2] - self.box[:2, 0]).clamp(min=1.0) / 2

@@ -56,7 +56,8 @@ class Settings:
 class State(NamedTuple):
     """Of B templates: ``pose`` (B, 3), the last increment ``delta`` (B, 3) in px at the farthest pixel and the
     ``factor`` (B,) that it was stretched by, the predicted remaining ``error`` (B,) in px there, ``iterations`` (B,)
-    and the last sampled ``patch`` (B, N). All but the patch are tensors or, while iterating on a CPU, numpy arrays."""
+    and the last sampled ``patch`` (B, N). On a CPU all but the patch are numpy arrays while they are iterated: a call
+    of numpy on three numbers takes a quarter of the time of torch's."""
 
     pose: Any
     delta: Any
@@ -103,7 +104,7 @@ def gauss_newton(reference: Reference, sample: Sampler, state: State, tolerance:
     seen = reference if sample.edge is None else reweigh(reference, inside(warp, reference.pixels, sample.edge))
     increment = alike(seen.criterion.step(seen, g), pose)  # eq. (9), or a better one
     radius = alike(reference.radius, pose)
-    delta = increment * xp.stack((xp.ones_like(radius), xp.ones_like(radius), radius), -1)
+    delta = xp.concatenate((increment[:, :2], increment[:, 2:] * radius[:, None]), -1)
     length = norm(delta)
     moving = (length < xp.inf) & busy  # NaN compares as not moving
     factor, rate = secant(state, delta, length)
