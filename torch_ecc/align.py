@@ -81,16 +81,15 @@ def solve_in_torch(
     the other, in its cache. Any other device is not stopped for the host to look at a value, so that a CUDA graph can
     hold all of this.
     """
-    image = image.float()
-    if border or not host_looks(pose.device):
+    image, some = image.float(), max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1)
+    if border or not host_looks(pose.device) or len(pose) <= some:
         return _solve_at_once(reference, image, pose, settings, border)
-    some = max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1)
     parts = []
     for k in range(0, len(pose), some):
         those = slice(k, k + some)
         view = image if len(image) == 1 else image[those]
         parts.append(_solve_at_once(reference.select(those), view, pose[those], settings, border))
-    return Estimate(*map(torch.cat, zip(*parts, strict=True))) if len(parts) > 1 else parts[0]
+    return Estimate(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def _solve_at_once(reference: Reference, image: Tensor, pose: Tensor, settings: Settings, border: bool) -> Estimate:
