@@ -23,7 +23,7 @@ LAYERS = [
     {"reference"},
     {"solver", "pyramid"},
     {"judge", "bank", "native"},
-    {"align", "patches"},
+    {"align", "nearby", "patches"},
     {"locate"},
     {"tracker"},
     {"compare", "session", "servo"},

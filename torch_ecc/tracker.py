@@ -15,6 +15,7 @@ from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.estimate import Estimate, Status, Track
 from torch_ecc.frame import as_device, as_gray, as_image
 from torch_ecc.locate import LEAST_SEEN, Located, Locator, as_good, halvings
+from torch_ecc.nearby import Nearby
 from torch_ecc.patches import Centers, Size, cut, locate_patches
 from torch_ecc.pose import compose, inverse, unwrap
 from torch_ecc.pyramid import SMALLEST_COARSE, pyramid
@@ -26,7 +27,8 @@ PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
 MEMORY = 0.05  # weight of the newest frame in the usual score
-AT_ONCE = 8  # templates searched for in one frame; the others in turn
+AT_ONCE = 8  # templates searched for in the whole of one frame; the others in turn
+NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
 SELDOM = 16  # frames between two searches for what has been lost for long
 
@@ -103,6 +105,7 @@ class Tracker(nn.Module):
         self.register_buffer("tracked", torch.ones_like(start[:, 0], dtype=torch.bool))
         self.register_buffer("doubted", torch.zeros_like(start[:, 0], dtype=torch.int64))  # frames in a row
         self._locators: dict[int, Locator] = {}  # of the templates last searched for
+        self._nearby: tuple[list[int], Nearby] | None = None
         self._turn = 0  # whose turn it is if they are many
 
     @classmethod
@@ -131,6 +134,7 @@ class Tracker(nn.Module):
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
         self.references = [reference.map(lambda tensor: tensor.to(device)) for reference in self.references]
         self._locators.clear()
+        self._nearby = None
         return self
 
     @torch.no_grad()
@@ -146,11 +150,14 @@ class Tracker(nn.Module):
             done = self._at_once(image)
             if done is not None:
                 return done
-        images = [image.float()]
-        estimate = self._solve(images, compose(self.pose, self.velocity))
-        if self.search:
-            for index in self._due(self._strange(estimate)):
-                estimate = self._search(images, estimate, index)
+        images, start = [image.float()], compose(self.pose, self.velocity)
+        estimate = self._solve(images, start)
+        due = self._due(self._strange(estimate)) if self.search else []
+        if due:
+            estimate = self._look_near(image, estimate, start, due[:NEARBY_AT_ONCE])
+            strange = self._strange(estimate).tolist()
+            for r in [r for r in due if strange[r]][:AT_ONCE]:
+                estimate = self._search(images, estimate, r)
         return self._advance(estimate)
 
     def track(self, frame: Tensor) -> Estimate:
@@ -202,10 +209,30 @@ class Tracker(nn.Module):
         if len(due) > AT_ONCE:
             self._turn = (self._turn + AT_ONCE) % len(due)
             due = due[self._turn :] + due[: self._turn]
-        return due[:AT_ONCE]
+        return due
+
+    def _look_near(self, image: Tensor, estimate: Estimate, start: Tensor, due: list[int]) -> Estimate:
+        """Second attempt for the templates ``due``: around their ``start`` (R, 3), and where they were last."""
+        index = torch.tensor(due, device=self.pose.device)
+        if self._nearby is None or self._nearby[0] != due:
+            self._nearby = due, Nearby.of(self.references[0].select(index))
+        own = image if len(image) == 1 else image.float()[index]  # torch 2.4 cannot index uint16
+        places = self._nearby[1].candidates(own, start[index])
+        for pose in places.unbind(1):
+            rest = self._strange(estimate)[index].nonzero()[:, 0]
+            if len(rest) == 0:
+                break
+            some = index[rest]
+            part = own if len(own) == 1 else own.float()[rest]
+            found = solve(self.references[0].select(some), part, pose[rest], self.settings)
+            found = found._replace(pose=torch.cat((found.pose[:, :2], unwrap(found.pose[:, 2:], self.pose[some, 2:])), -1))
+            better = (found.status == Status.CONVERGED) & as_good(found.score, self.score[some])
+            kept = better.nonzero()[:, 0]
+            estimate = Estimate(*(e.index_copy(0, some[kept], f[kept]) for e, f in zip(estimate, found, strict=True)))
+        return estimate
 
     def _search(self, images: list[Tensor], estimate: Estimate, r: int) -> Estimate:
-        """Second attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
+        """Third attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
         locator = self._locators.get(r)
         if locator is None:
             if len(self._locators) >= AT_ONCE:
