@@ -1,9 +1,9 @@
 """Jumps from one frame to the next, found near or in the whole frame: python benchmarks/jumps.py [DATA] [trials].
 
-Random patches of five scenes and of the photographs in DATA/stills jump in a random direction and turn, alternately before
-three trackers: without any search, with the search of the whole frame alone, and as shipped, where a small search around
-the expected place comes first. "found": within 0.5 px in the very next frame; "wrong": believed, and farther off. Mean
-time of that frame, on one thread, with what has to be prepared for a search in it.
+Random patches of four scenes and of the photographs in DATA/stills jump in a random direction and turn, before three
+trackers in turn: without any search, with the search of the whole frame alone, and as shipped, where a small search
+around the expected place comes first. "found": within 0.5 px in the very next frame; "wrong": believed, and farther
+off. Mean time of that frame, on one thread, with what has to be prepared for a search in it.
 """
 
 from __future__ import annotations

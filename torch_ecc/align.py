@@ -69,7 +69,7 @@ def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings)
     rest = (estimate.status < 0).nonzero()[:, 0]
     part = image if len(image) == 1 else image.float()[rest]  # torch 2.4 cannot index uint16
     settled = solve_in_torch(reference.select(rest), part, pose[rest], settings, border=True)
-    return Estimate(*(e.index_copy(0, rest, s) for e, s in zip(estimate, settled, strict=True)))
+    return estimate.put(rest, settled)
 
 
 def solve_in_torch(

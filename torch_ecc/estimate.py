@@ -61,6 +61,14 @@ class Estimate(NamedTuple):
         """Standard deviations of the pose: (R, 3) px, px, rad."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
 
+    def at(self, index: Tensor) -> Estimate:
+        """The templates at ``index`` (n,)."""
+        return Estimate(*(value[index] for value in self))
+
+    def put(self, index: Tensor, part: Estimate) -> Estimate:
+        """This record with the templates at ``index`` (n,) replaced by ``part`` (n, ...)."""
+        return Estimate(*(value.index_copy(0, index, new) for value, new in zip(self, part, strict=True)))
+
 
 class Track(Estimate):
     """The fields of Estimate stacked over F frames: (F, R, ...)."""

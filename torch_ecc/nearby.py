@@ -1,7 +1,7 @@
 """Templates looked for around where they are expected: every place within some px and a few small turns at once.
 
-What brings a template back that is out of Gauss-Newton's reach, for a tenth of a search of the whole frame (``locate``).
-Weighted normalised correlation by FFT, as coarse as the texture allows.
+What brings a template back that is out of Gauss-Newton's reach, for a tenth of what a search of the whole frame costs
+(``locate``). Weighted normalised correlation by FFT, as coarse as the texture allows.
 """
 
 from __future__ import annotations
@@ -13,18 +13,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torch_ecc.align import solve
 from torch_ecc.bank import SMALLEST_SEARCHED
+from torch_ecc.estimate import Estimate, Status
 from torch_ecc.pose import compose, rotation
 from torch_ecc.pyramid import as_images
 from torch_ecc.reference import Reference, safe_inverse
 from torch_ecc.sampling import Bilinear, inside
+from torch_ecc.solver import Settings
 
 FARTHEST = 16  # px
 WIDEST, TURN = math.radians(9), math.radians(1.5)  # the largest turn, and from one to the next
 STEPS = (8, 4, 2, 1)  # px between the pixels that are compared
 LEAST_DENSITY = 2.0  # texture that is left, over what white noise of the same contrast would leave
 LARGEST = 49  # of them across: they tell enough
-TRIED = 3  # places per template
+TRIED = 3  # places per template that are brought to the answer
+HANDICAP = 0.25  # of correlation: what such a place may lack to the best one
+CLEARLY = 0.9  # of what the score of a nearer place lacks to 1: a farther one must lack less
 
 
 class Nearby(NamedTuple):
@@ -59,9 +64,27 @@ class Nearby(NamedTuple):
         spectra = (torch.fft.rfft2(kernel, s=_fast(shape)).conj_physical() for kernel in (texture, weights))
         return Nearby(step, shape, middle.to(reference.radius), *spectra)
 
-    def candidates(self, image: Tensor, pose: Tensor) -> Tensor:
+    def find(self, reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
+        """The templates in ``image`` (1 or B, 1, H, W) around ``pose`` (B, 3): the nearest of those places that are not
+        clearly worse than another."""
+        place, score = self.candidates(image, pose)
+        away = ((place - pose[:, None]) * reference.lever[:, None]).norm(dim=-1)
+        order = torch.where(score >= score[:, :1] - HANDICAP, away, torch.inf).sort(-1)
+        place = place.gather(1, order.indices[..., None].expand_as(place))
+        best = solve(reference, image, place[:, 0], settings)
+        for k in range(1, TRIED):
+            some = order.values[:, k].isfinite().nonzero()[:, 0]
+            if len(some):
+                own = image if len(image) == 1 else image[some]
+                found = solve(reference.select(some), own, place[some, k], settings)
+                lack = torch.where(Status.good(best.status[some]), 1 - best.score[some], torch.inf)
+                better = ((found.status == Status.CONVERGED) & (1 - found.score < CLEARLY * lack)).nonzero()[:, 0]
+                best = best.put(some[better], found.at(better))
+        return best
+
+    def candidates(self, image: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Where ``image`` (1 or B, 1, H, W) looks most like the templates around ``pose`` (B, 3): (B, TRIED, 3), the
-        best first."""
+        best first, and the correlations (B, TRIED)."""
         g = self._surroundings(image, pose)
         shape = _fast(self.shape)
         spectra = torch.fft.rfft2(torch.stack((g, g * g), 1), s=shape)
@@ -72,12 +95,12 @@ class Nearby(NamedTuple):
         )
         power = average[:, 1] - average[:, 0].square()
         floor = 1e-4 * power.amax((1, 2), keepdim=True).clamp(min=1e-12)
-        place = _peaks(match * torch.maximum(power, floor).rsqrt()[:, None])
+        place, score = _peaks(match * torch.maximum(power, floor).rsqrt()[:, None])
         middle = self.middle[:, None].expand(-1, TRIED, -1)
         flat = torch.zeros_like(middle[..., :1])
         shift = place[..., :2] * self.step + middle
         turned = compose(torch.cat((shift, place[..., 2:] * TURN), -1), torch.cat((-middle, flat), -1))
-        return compose(pose[:, None].expand_as(turned), turned)
+        return compose(pose[:, None].expand_as(turned), turned), score
 
     def _surroundings(self, image: Tensor, pose: Tensor) -> Tensor:
         """Grey levels (B, H, W) about their mean, turned as the templates are at ``pose``."""
@@ -91,20 +114,21 @@ class Nearby(NamedTuple):
         return g - g.mean((1, 2), keepdim=True)
 
 
-def _peaks(score: Tensor) -> Tensor:
+def _peaks(score: Tensor) -> tuple[Tensor, Tensor]:
     """The TRIED highest maxima of scores (B, A, h, w), between pixels and turns by parabolas, counted from the middle:
-    x, y, turn (B, TRIED, 3). The outermost places and turns are only there to be compared with."""
+    x, y, turn (B, TRIED, 3), and their heights (B, TRIED). The outermost places and turns are only
+    there to be compared with."""
     volume = score.flatten(1)
     inner = score[:, 1:-1, 1:-1, 1:-1]
     peak = torch.where(inner >= F.max_pool3d(score[:, None], 3, 1)[:, 0], inner, -1.0)
-    _, index = peak.flatten(1).topk(TRIED)
+    height, index = peak.flatten(1).topk(TRIED)
     a, h, w = inner.shape[1:]
     cell = torch.stack((index % w, index // w % h, index // (w * h)), -1)
     stride = cell.new_tensor((1, w + 2, (w + 2) * (h + 2)))
     index = ((cell + 1) * stride).sum(-1, keepdim=True)
     before, top, after = (volume.gather(1, (index + k * stride).flatten(1)).view(cell.shape) for k in (-1, 0, 1))
     offset = (after - before) / 2 / (2 * top - before - after).clamp(min=1e-6)
-    return (cell - (cell.new_tensor((w, h, a)) - 1) / 2 + offset.clamp(-0.5, 0.5)).double()
+    return (cell - (cell.new_tensor((w, h, a)) - 1) / 2 + offset.clamp(-0.5, 0.5)).double(), height
 
 
 def _coarser(template: Tensor, weight: Tensor, step: int) -> tuple[Tensor, Tensor]:

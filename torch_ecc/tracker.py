@@ -14,7 +14,7 @@ from torch_ecc.align import solve
 from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.estimate import Estimate, Status, Track
 from torch_ecc.frame import as_device, as_gray, as_image
-from torch_ecc.locate import LEAST_SEEN, Located, Locator, as_good, halvings
+from torch_ecc.locate import LEAST_SEEN, Located, Locator, as_good, halvings, likeness
 from torch_ecc.nearby import Nearby
 from torch_ecc.patches import Centers, Size, cut, locate_patches
 from torch_ecc.pose import compose, inverse, unwrap
@@ -154,7 +154,7 @@ class Tracker(nn.Module):
         estimate = self._solve(images, start)
         due = self._due(self._strange(estimate)) if self.search else []
         if due:
-            estimate = self._look_near(image, estimate, start, due[:NEARBY_AT_ONCE])
+            estimate = self._look_near(image, estimate, start, sorted(due))
             strange = self._strange(estimate).tolist()
             for r in [r for r in due if strange[r]][:AT_ONCE]:
                 estimate = self._search(images, estimate, r)
@@ -190,12 +190,20 @@ class Tracker(nn.Module):
         return step[0]
 
     def _solve(self, images: list[Tensor], pose: Tensor) -> Estimate:
-        """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are."""
+        """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are.
+
+        What a level has found is kept only if it looks better than its start to the next finer one: fine texture is
+        not there in a coarse level, which then leads anywhere.
+        """
         images += halvings(images[-1], self.levels)[1:]
+        double, budget = pose.new_tensor((2.0, 2.0, 1.0)), self.settings.max_iterations
+        pose = pose / double ** (self.levels - 1)
         for level in range(self.levels - 1, 0, -1):
-            reference, scale = self.references[level], pose.new_tensor((2.0**level, 2.0**level, 1.0))
-            state, budget = State.start(reference, pose / scale), self.settings.max_iterations
-            pose = stage(reference, images[level], state, "bilinear", COARSE_TOLERANCE, budget).pose * scale
+            state = State.start(self.references[level], pose)
+            state = stage(self.references[level], images[level], state, "bilinear", COARSE_TOLERANCE, budget)
+            pose, coarse, finer = pose * double, state.pose * double, (self.references[level - 1], images[level - 1])
+            better = likeness(*finer, coarse) > likeness(*finer, pose)
+            pose = torch.where(better[:, None], coarse, pose)
         return solve(self.references[0], images[0], pose, self.settings)
 
     def _strange(self, estimate: Estimate) -> Tensor:
@@ -209,27 +217,17 @@ class Tracker(nn.Module):
         if len(due) > AT_ONCE:
             self._turn = (self._turn + AT_ONCE) % len(due)
             due = due[self._turn :] + due[: self._turn]
-        return due
+        return due[:NEARBY_AT_ONCE]
 
     def _look_near(self, image: Tensor, estimate: Estimate, start: Tensor, due: list[int]) -> Estimate:
-        """Second attempt for the templates ``due``: around their ``start`` (R, 3), and where they were last."""
+        """Second attempt for the templates ``due``: around their ``start`` (R, 3)."""
         index = torch.tensor(due, device=self.pose.device)
         if self._nearby is None or self._nearby[0] != due:
             self._nearby = due, Nearby.of(self.references[0].select(index))
         own = image if len(image) == 1 else image.float()[index]  # torch 2.4 cannot index uint16
-        places = self._nearby[1].candidates(own, start[index])
-        for pose in places.unbind(1):
-            rest = self._strange(estimate)[index].nonzero()[:, 0]
-            if len(rest) == 0:
-                break
-            some = index[rest]
-            part = own if len(own) == 1 else own.float()[rest]
-            found = solve(self.references[0].select(some), part, pose[rest], self.settings)
-            found = found._replace(pose=torch.cat((found.pose[:, :2], unwrap(found.pose[:, 2:], self.pose[some, 2:])), -1))
-            better = (found.status == Status.CONVERGED) & as_good(found.score, self.score[some])
-            kept = better.nonzero()[:, 0]
-            estimate = Estimate(*(e.index_copy(0, some[kept], f[kept]) for e, f in zip(estimate, found, strict=True)))
-        return estimate
+        found = self._nearby[1].find(self.references[0].select(index), own, start[index], self.settings)
+        known = (found.status == Status.CONVERGED) & as_good(found.score, self.score[index])
+        return estimate.put(index[known], found.at(known))
 
     def _search(self, images: list[Tensor], estimate: Estimate, r: int) -> Estimate:
         """Third attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
@@ -251,7 +249,7 @@ class Tracker(nn.Module):
             return estimate
         best = found._replace(pose=torch.cat((found.pose[:, :2], unwrap(found.pose[:, 2:], self.pose[r, 2])), -1))
         index = torch.tensor([r], device=self.pose.device)
-        return Estimate(*(e.index_copy(0, index, f[:1]) for e, f in zip(estimate, best, strict=True)))
+        return estimate.put(index, best.at(index.new_zeros(1)))
 
     def _advance(self, estimate: Estimate) -> Estimate:
         good = Status.good(estimate.status)[:, None]
