@@ -62,13 +62,14 @@ def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings)
 
 def track(
     reference: Reference, image: Tensor, state: list[Tensor], settings: Settings, *, hold: bool, search: bool
-) -> tuple[Estimate, list[Tensor]] | None:
+) -> tuple[Estimate | None, list[Tensor]]:
     """One frame of a Tracker of one level: its estimate and the next ``state`` = [pose, velocity, start, score,
-    tracked, doubted]. None if the torch path is needed: for templates at the border, or some to ``search`` for."""
+    tracked, doubted]. The state is empty, the estimate that of ``solve``, if there are some to ``search`` for; None if
+    the torch path is needed: for templates at the border."""
     operator = torch.ops.torch_ecc.track.default
     fields = operator(image, packed(reference), state, *_options(settings), hold, search)
     count = len(Estimate._fields)
-    return (Estimate(*fields[:count]), fields[count:]) if fields else None
+    return Estimate(*fields[:count]) if fields else None, fields[count:]
 
 
 def packed(reference: Reference) -> Tensor:

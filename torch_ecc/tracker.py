@@ -146,12 +146,12 @@ class Tracker(nn.Module):
         image = as_image("track", "frame", frame, self.pose.device)
         if image.shape != self.frame_shape:
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
-        if self.levels == 1 and native.serves(self.references[0], image, self.settings):
-            done = self._at_once(image)
-            if done is not None:
-                return done
+        estimate, done = self._at_once(image)
+        if estimate is not None and done:
+            return estimate
         images, start = [image.float()], compose(self.pose, self.velocity)
-        estimate = self._solve(images, start)
+        if estimate is None:
+            estimate = self._solve(images, start)
         due = self._due(self._strange(estimate)) if self.search else []
         if due:
             estimate = self._look_near(image, estimate, start, sorted(due))
@@ -179,15 +179,16 @@ class Tracker(nn.Module):
             raise ValueError("track_sequence: frames must hold at least one frame, got none")
         return Track.stack(estimates)
 
-    def _at_once(self, image: Tensor) -> Estimate | None:
-        """Prediction, solve and update in one native call; None if that is not all that this frame needs."""
+    def _at_once(self, image: Tensor) -> tuple[Estimate | None, bool]:
+        """Prediction, solve and update in one native call, and whether that is all that this frame needs: without the
+        update if some are to be searched for, None where the native path does not serve."""
+        if self.levels > 1 or not native.serves(self.references[0], image, self.settings):
+            return None, False
         state: list[Any] = [self._buffers[name] for name in STATE]  # a module's attributes are slow
         hold = self.prediction == "hold"
-        step = native.track(self.references[0], image, state, self.settings, hold=hold, search=self.search)
-        if step is None:
-            return None
-        self._buffers.update(zip(STATE, step[1], strict=True))
-        return step[0]
+        estimate, state = native.track(self.references[0], image, state, self.settings, hold=hold, search=self.search)
+        self._buffers.update(zip(STATE, state, strict=False))  # none, if some are to be searched for
+        return estimate, bool(state)
 
     def _solve(self, images: list[Tensor], pose: Tensor) -> Estimate:
         """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are.

@@ -80,7 +80,7 @@ std::tuple<std::vector<Tensor>, int64_t> solve(const Tensor& image, const Tensor
 }
 
 // One frame of Tracker: state = [pose, velocity, start, score, tracked, doubted] -> the fields of Estimate and the next
-// state; or nothing if the torch path is needed, for templates at the border, or if there are some to be searched for.
+// state; the fields alone, as of solve, if some are to be searched for; nothing if some at the border need the torch path.
 std::vector<Tensor> track(const Tensor& image, const Tensor& templates, at::TensorList state, int64_t degree,
                           int64_t max_iterations, double tolerance, double min_score, bool hold, bool search) {
   const int64_t count = state[0].size(0);
@@ -102,7 +102,8 @@ std::vector<Tensor> track(const Tensor& image, const Tensor& templates, at::Tens
   };
   bool all_familiar = true;
   for (int64_t b = 0; b < count; ++b) all_familiar = all_familiar && !strange(b);
-  if (out.unsettled || (search && !all_familiar)) return {};
+  if (out.unsettled) return {};
+  if (search && !all_familiar) return out.fields();
   for (int64_t b = 0; b < count; ++b) {  // Tracker._advance
     const bool good = ecc::good(status[b]);
     double *found = out.pose.data_ptr<double>() + 3 * b, *moved = out.displacement.data_ptr<double>() + 3 * b;
