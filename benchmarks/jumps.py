@@ -3,7 +3,8 @@
 Random patches of four scenes and of the photographs in DATA/stills jump in a random direction and turn, before three
 trackers in turn: without any search, with the search of the whole frame alone, and as shipped, where a small search
 around the expected place comes first. "found": within 0.5 px in the very next frame; "wrong": believed, and farther
-off. Mean time of that frame, on one thread, with what has to be prepared for a search in it.
+off. Mean time of that frame, on one thread, with what has to be prepared for a search in it. Then whole sequences: time
+per frame with the search of the whole frame alone and as shipped, alternately.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
-from work import fine, waves
+from work import WORKS, fine, waves
 
 from torch_ecc import Status, Tracker, texture
 from torch_ecc.estimate import Estimate
@@ -27,6 +28,7 @@ from torch_ecc.io import open_frames
 from torch_ecc.pose import compose
 from torch_ecc.sim import Camera, Pads, Scene, Speckle
 from torch_ecc.sim.still import image_scene
+from torch_ecc.tracker import PREDICTIONS
 
 MIDDLE = torch.tensor([320.0, 240.0, 0.0], dtype=torch.float64)
 LENGTHS, TURNS = (4.0, 8.0, 12.0, 16.0, 24.0, 40.0), (0.0, 2.0, 5.0, 10.0)  # px, deg
@@ -91,6 +93,23 @@ def row(scene: Scene, spread: tuple[float, float], side: int, count: int) -> lis
     return [*cells, " / ".join(map(str, wrong)), times]
 
 
+def sequence(name: str, prediction: str) -> list[str]:
+    """A work of ``work.WORKS``: mean and worst time per frame, frames lost and rms error of both trackers."""
+    work = WORKS[name].make(name, 0)
+    trackers = [make(work.frames[0], [work.center], work.size, prediction=prediction) for make in (WholeFrame, Tracker)]
+    times, poses, lost = [[], []], [[], []], [0, 0]
+    for frame in work.frames[1:]:
+        for k, tracker in enumerate(trackers):
+            begun = time.process_time()
+            estimate = tracker(frame)
+            times[k].append(1e3 * (time.process_time() - begun))
+            poses[k].append(estimate.pose[0])
+            lost[k] += not bool(Status.good(estimate.status[0]))
+    error = [(torch.stack(p) - work.truth)[:, :2].square().mean().sqrt() for p in poses]
+    cells = ([f"{sum(t) / len(t):.2f}" for t in times], [f"{max(t):.1f}" for t in times], map(str, lost))
+    return [name, prediction, *(" / ".join(cell) for cell in cells), " / ".join(f"{float(e):.4f}" for e in error)]
+
+
 def main() -> None:
     data = Path(sys.argv[1] if len(sys.argv) > 1 else os.environ["TORCH_ECC_DATA"])
     count = int(sys.argv[2]) if len(sys.argv) > 2 else 10
@@ -108,6 +127,12 @@ def main() -> None:
     for name, (scene, spread) in scenes.items():
         for side in SIDES:
             table.add_row(name, str(side), *row(scene, spread, side, count))
+    console.print(table)
+    columns = ("ms, mean", "ms, worst", "lost", "rms px")
+    table = Table("work", "prediction", *columns, title="Sequences: whole frame / as shipped")
+    for name in ("clean", "hard", "jumps"):
+        for prediction in PREDICTIONS:
+            table.add_row(*sequence(name, prediction))
     console.print(table)
 
 

@@ -22,14 +22,14 @@ from torch_ecc.reference import Reference, safe_inverse
 from torch_ecc.sampling import Bilinear, inside
 from torch_ecc.solver import Settings
 
-FARTHEST = 16  # px
+FARTHEST = 24  # px
 WIDEST, TURN = math.radians(9), math.radians(1.5)  # the largest turn, and from one to the next
 STEPS = (8, 4, 2, 1)  # px between the pixels that are compared
 LEAST_DENSITY = 2.0  # texture that is left, over what white noise of the same contrast would leave
 LARGEST = 49  # of them across: they tell enough
 TRIED = 3  # places per template that are brought to the answer
 HANDICAP = 0.25  # of correlation: what such a place may lack to the best one
-CLEARLY = 0.9  # of what the score of a nearer place lacks to 1: a farther one must lack less
+CLEARLY = (0.9, 0.002)  # a farther place must lack less to a score of 1 than a times what a nearer one lacks, minus b
 
 
 class Nearby(NamedTuple):
@@ -78,7 +78,8 @@ class Nearby(NamedTuple):
                 own = image if len(image) == 1 else image[some]
                 found = solve(reference.select(some), own, place[some, k], settings)
                 lack = torch.where(Status.good(best.status[some]), 1 - best.score[some], torch.inf)
-                better = ((found.status == Status.CONVERGED) & (1 - found.score < CLEARLY * lack)).nonzero()[:, 0]
+                clearly = 1 - found.score < CLEARLY[0] * lack - CLEARLY[1]
+                better = (clearly & (found.status == Status.CONVERGED)).nonzero()[:, 0]
                 best = best.put(some[better], found.at(better))
         return best
 
@@ -96,7 +97,7 @@ class Nearby(NamedTuple):
         power = average[:, 1] - average[:, 0].square()
         floor = 1e-4 * power.amax((1, 2), keepdim=True).clamp(min=1e-12)
         place, score = _peaks(match * torch.maximum(power, floor).rsqrt()[:, None])
-        middle = self.middle[:, None].expand(-1, TRIED, -1)
+        place, middle = place.to(self.middle), self.middle[:, None].expand(-1, TRIED, -1)
         flat = torch.zeros_like(middle[..., :1])
         shift = place[..., :2] * self.step + middle
         turned = compose(torch.cat((shift, place[..., 2:] * TURN), -1), torch.cat((-middle, flat), -1))
@@ -109,7 +110,7 @@ class Nearby(NamedTuple):
         turn = rotation(pose[:, 2])
         warp = torch.cat((turn, pose[:, :2, None] + turn @ self.middle[:, :, None]), -1)
         pixels = torch.stack((x.flatten(), y.flatten(), torch.ones_like(x.flatten())))
-        g = Bilinear(image.float())(warp, pixels).view(-1, *sides)
+        g = Bilinear(image)(warp, pixels).view(-1, *sides)
         g = _rows(sides[0], self.shape[0], self.step, g) @ g @ _rows(sides[1], self.shape[1], self.step, g).mT
         return g - g.mean((1, 2), keepdim=True)
 
@@ -128,7 +129,7 @@ def _peaks(score: Tensor) -> tuple[Tensor, Tensor]:
     index = ((cell + 1) * stride).sum(-1, keepdim=True)
     before, top, after = (volume.gather(1, (index + k * stride).flatten(1)).view(cell.shape) for k in (-1, 0, 1))
     offset = (after - before) / 2 / (2 * top - before - after).clamp(min=1e-6)
-    return (cell - (cell.new_tensor((w, h, a)) - 1) / 2 + offset.clamp(-0.5, 0.5)).double(), height
+    return cell - (cell.new_tensor((w, h, a)) - 1) / 2 + offset.clamp(-0.5, 0.5), height
 
 
 def _coarser(template: Tensor, weight: Tensor, step: int) -> tuple[Tensor, Tensor]:

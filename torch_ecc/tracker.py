@@ -51,8 +51,9 @@ class Tracker(nn.Module):
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
     the frame's); ``min_score``: below it a template is lost; ``search``: look for a template that is lost, or looks
-    less like itself than usual, in the whole frame at any angle: in every frame at first, and ever more seldom the
-    longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or "native", see solver.Settings.
+    less like itself than usual, near where it is expected and then in the whole frame at any angle: in every frame at
+    first, and ever more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or
+    "native", see solver.Settings.
     Raises ValueError for what does not fit.
     """
 
@@ -154,7 +155,7 @@ class Tracker(nn.Module):
             estimate = self._solve(images, start)
         due = self._due(self._strange(estimate)) if self.search else []
         if due:
-            estimate = self._look_near(image, estimate, start, sorted(due))
+            estimate = self._look_near(images[0], estimate, start, sorted(due))
             strange = self._strange(estimate).tolist()
             for r in [r for r in due if strange[r]][:AT_ONCE]:
                 estimate = self._search(images, estimate, r)
@@ -225,7 +226,7 @@ class Tracker(nn.Module):
         index = torch.tensor(due, device=self.pose.device)
         if self._nearby is None or self._nearby[0] != due:
             self._nearby = due, Nearby.of(self.references[0].select(index))
-        own = image if len(image) == 1 else image.float()[index]  # torch 2.4 cannot index uint16
+        own = image if len(image) == 1 else image[index]
         found = self._nearby[1].find(self.references[0].select(index), own, start[index], self.settings)
         known = (found.status == Status.CONVERGED) & as_good(found.score, self.score[index])
         return estimate.put(index[known], found.at(known))
