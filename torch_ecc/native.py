@@ -30,7 +30,7 @@ SOURCES = Path(__file__).parent / "csrc"
 DEGREE = {"bilinear": 1, "bspline3": 3, "bspline5": 5}
 CODE: dict[type[Criterion], int] = {SSD: -1, PaperECC: -2}  # beside ECC's number of light columns
 DTYPES = (torch.uint8, torch.uint16, torch.float32)
-_packed: dict[int, tuple[weakref.ref[Tensor], Tensor]] = {}  # by the id of K
+_packed: dict[int, tuple[weakref.ref[Tensor], Reference, Tensor]] = {}  # by the id of K
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.
 MATHS = ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"]
 INSTRUCTIONS = {
@@ -74,14 +74,14 @@ def track(
 
 def packed(reference: Reference) -> Tensor:
     """The templates (B, bytes) as the C++ reads them: 16-bit images, made once for as long as the reference lives."""
-    key = id(reference.K)
+    key, rest = id(reference.K), reference._replace(K=reference.sparse)  # what holds K would keep it alive
     known = _packed.get(key)
-    if known is not None and known[0]() is reference.K:
-        return known[1]
+    if known is not None and known[0]() is reference.K and all(a is b for a, b in zip(known[1], rest, strict=True)):
+        return known[2]
     criterion = reference.criterion
     code = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else CODE[type(criterion)]
     made: Tensor = torch.ops.torch_ecc.pack.default(list(reference[1:]), code)
-    _packed[key] = weakref.ref(reference.K, lambda _: _packed.pop(key, None)), made
+    _packed[key] = weakref.ref(reference.K, lambda _: _packed.pop(key, None)), rest, made
     return made
 
 

@@ -15,10 +15,11 @@ from torch import Tensor
 
 from torch_ecc.align import solve
 from torch_ecc.bank import SMALLEST_SEARCHED
+from torch_ecc.criteria import safe_inverse
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.pose import compose, rotation
 from torch_ecc.pyramid import as_images
-from torch_ecc.reference import Reference, safe_inverse
+from torch_ecc.reference import Reference
 from torch_ecc.sampling import Bilinear, inside
 from torch_ecc.solver import Settings
 
@@ -68,7 +69,8 @@ class Nearby(NamedTuple):
         """The templates in ``image`` (1 or B, 1, H, W) around ``pose`` (B, 3): the nearest of those places that are not
         clearly worse than another."""
         place, score = self.candidates(image, pose)
-        away = ((place - pose[:, None]) * reference.lever[:, None]).norm(dim=-1)
+        step = place - pose[:, None]
+        away = torch.cat((step[..., :2], step[..., 2:] * reference.radius[:, None, None]), -1).norm(dim=-1)
         order = torch.where(score >= score[:, :1] - HANDICAP, away, torch.inf).sort(-1)
         place = place.gather(1, order.indices[..., None].expand_as(place))
         best = solve(reference, image, place[:, 0], settings)
