@@ -81,7 +81,8 @@ def packed(reference: Reference) -> Tensor:
     criterion = reference.criterion
     code = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else CODE[type(criterion)]
     made: Tensor = torch.ops.torch_ecc.pack.default(list(reference[1:]), code)
-    _packed[key] = weakref.ref(reference.K, lambda _: _packed.pop(key, None)), rest, made
+    forget = _packed.pop  # a module's names are gone when the interpreter ends
+    _packed[key] = weakref.ref(reference.K, lambda _: forget(key, None)), rest, made
     return made
 
 

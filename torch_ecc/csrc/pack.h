@@ -38,17 +38,29 @@ inline void invert(double (&matrix)[MOST][MOST], int64_t n) {
     }
 }
 
+struct Grid {  // chosen pixels of a template: numbers, and columns and rows in its bounding box
+  std::vector<int64_t> pixel, column, row, at;  // at: in the rows of Pixels
+  int64_t size() const { return int64_t(pixel.size()); }
+};
+
 struct Packer {
   std::vector<at::Tensor> fields;
   int64_t criterion;
-  std::vector<int64_t> all, some;  // pixels of the whole and of the thin template
+  Grid all, some;  // of the whole and of the thin template
 
   Packer(at::TensorList reference, int64_t criterion) : criterion(criterion) {
     for (const at::Tensor& tensor : reference) fields.push_back(tensor.contiguous());
-    all.resize(fields[PIXELS].size(1));
-    std::iota(all.begin(), all.end(), 0);
+    const int64_t n = fields[PIXELS].size(1);
+    all.pixel.resize(n);
+    std::iota(all.pixel.begin(), all.pixel.end(), 0);
     const int64_t* sparse = fields[SPARSE].const_data_ptr<int64_t>();
-    some.assign(sparse, sparse + fields[SPARSE].size(0));
+    some.pixel.assign(sparse, sparse + fields[SPARSE].size(0));
+    const float *pixels = fields[PIXELS].const_data_ptr<float>(), *box = fields[BOX].const_data_ptr<float>();
+    for (Grid* grid : {&all, &some})
+      for (int64_t i : grid->pixel) {
+        grid->column.push_back(std::lround(pixels[i] - box[0]));
+        grid->row.push_back(std::lround(pixels[n + i] - box[4]));
+      }
   }
 
   template <class T>
@@ -56,24 +68,24 @@ struct Packer {
     const at::Tensor& tensor = fields[field];
     return tensor.const_data_ptr<T>() + (tensor.size(0) == 1 ? 0 : b) * (tensor.numel() / tensor.size(0));
   }
-  int64_t place(int64_t i, int axis) const {  // column or row in the bounding box
-    return int64_t(std::lround(fields[PIXELS].const_data_ptr<float>()[axis * int64_t(all.size()) + i] -
-                               fields[BOX].const_data_ptr<float>()[4 * axis]));
-  }
 
-  // Shape of the grid of `chosen` pixels, and where its arrays lie behind `end`, which moves on.
-  Pixels shape(const std::vector<int64_t>& chosen, bool whole, int64_t& end) const {
+  // Shape of the grid of chosen pixels, and where its arrays lie behind `end`, which moves on.
+  Pixels shape(Grid& chosen, bool whole, int64_t& end) const {
     Pixels p{};
     int64_t step = 0;
-    for (int64_t i : chosen) step = std::gcd(std::gcd(step, place(i, 0)), place(i, 1));
-    step = std::max<int64_t>(step, 1);
-    for (int64_t i : chosen) {
-      p.width = std::max(p.width, place(i, 0) / step + 1);
-      p.height = std::max(p.height, place(i, 1) / step + 1);
+    for (int64_t i = 0; i < chosen.size(); ++i) {
+      step = std::gcd(std::gcd(step, chosen.column[i]), chosen.row[i]);
+      p.width = std::max(p.width, chosen.column[i] + 1);
+      p.height = std::max(p.height, chosen.row[i] + 1);
     }
+    step = std::max<int64_t>(step, 1);
+    p.width = (p.width + step - 1) / step;
+    p.height = (p.height + step - 1) / step;
     p.step = double(step);
     p.pitch = padded(p.width);
-    const bool even = fields[WEIGHT].size(0) == 1 && int64_t(chosen.size()) == p.width * p.height &&
+    for (int64_t i = 0; i < chosen.size(); ++i)
+      chosen.at.push_back(chosen.row[i] / step * p.pitch + chosen.column[i] / step);
+    const bool even = fields[WEIGHT].size(0) == 1 && chosen.size() == p.width * p.height &&
                       fields[WEIGHT].eq(1).all().item<bool>();
     p.weight_pitch = even ? 0 : p.pitch;  // one row serves if all are alike
     const auto take = [&](int64_t bytes) { return std::exchange(end, (end + bytes + 63) / 64 * 64); };
@@ -83,71 +95,74 @@ struct Packer {
     return p;
   }
 
-  // Values (3, N) of `chosen` pixels, the first two in one unit and the third less its mean, as integers.
-  void round(const Pixels& p, const std::vector<int64_t>& chosen, const float* const (&from)[3], Images& images,
-             char* block) const {
-    double sum = 0;
-    for (int64_t i : chosen) sum += from[2][i];
-    images.level = float(sum / double(chosen.size()));
-    const auto level = [&](int k) { return k == 2 ? images.level : 0.f; };
+  // Values (3, n) of the chosen pixels, the first two in one unit and the third less its mean, as integers.
+  void round(const Grid& chosen, const float* const (&from)[3], Images& images, char* block) const {
+    const int64_t n = chosen.size();
+    images.level = float(std::accumulate(from[2], from[2] + n, 0.0) / double(n));
     float most[3] = {1e-30f, 1e-30f, 1e-30f};
+    const auto level = [&](int k) { return k == 2 ? images.level : 0.f; };
     for (int k = 0; k < 3; ++k)
-      for (int64_t i : chosen) most[k] = std::max(most[k], std::abs(from[k][i] - level(k)));
+      for (int64_t i = 0; i < n; ++i) most[k] = std::max(most[k], std::abs(from[k][i] - level(k)));
     images.gradient = std::max(most[0], most[1]) / 32767;
     images.grey = most[2] / 32767;
     for (int k = 0; k < 3 && images.at[k] > 0; ++k) {
       int16_t* const to = reinterpret_cast<int16_t*>(block + images.at[k]);
-      for (int64_t i : chosen) {
-        const float value = (from[k][i] - level(k)) / (k == 2 ? images.grey : images.gradient);
-        to[at(p, i)] = int16_t(std::lround(std::clamp(value, -32767.f, 32767.f)));
-      }
+      const float unit = k == 2 ? images.grey : images.gradient;
+      for (int64_t i = 0; i < n; ++i)
+        to[chosen.at[i]] = int16_t(std::nearbyint(std::clamp((from[k][i] - level(k)) / unit, -32767.f, 32767.f)));
     }
   }
 
-  int64_t at(const Pixels& p, int64_t i) const {
-    return place(i, 1) / int64_t(p.step) * p.pitch + place(i, 0) / int64_t(p.step);
-  }
-
-  void fill(Pixels& p, const std::vector<int64_t>& chosen, int64_t b, Template& t) const {
-    const int64_t n = int64_t(all.size());
+  void fill(Pixels& p, const Grid& chosen, int64_t b, Template& t) const {
+    const int64_t n = chosen.size(), all_pixels = all.size();
     char* const block = reinterpret_cast<char*>(&t);
-    const float *signal = of<float>(SIGNAL, b), *blurred = of<float>(INSTRUMENT, b), *weight = of<float>(WEIGHT, b);
+    std::vector<float> lines(8 * n);  // d/dx, d/dy, d/dtheta and t, raw and blurred
+    float* row[8];
+    for (int k = 0; k < 8; ++k) {
+      const float* from = of<float>(k < 4 ? SIGNAL : INSTRUMENT, b) + k % 4 * all_pixels;
+      row[k] = lines.data() + k * n;
+      for (int64_t i = 0; i < n; ++i) row[k][i] = from[chosen.pixel[i]];
+    }
+    const float* weight = of<float>(WEIGHT, b);
     p.left = t.box[0][0] - t.centre[0];
     p.top = t.box[1][0] - t.centre[1];
     p.columns = t.columns;
     float* const w = reinterpret_cast<float*>(block + p.weight);
-    for (int64_t i : chosen) w[p.weight_pitch ? at(p, i) : at(p, i) % p.pitch] = weight[i];
-    round(p, chosen, {blurred, blurred + n, blurred + 3 * n}, p.z, block);
-    round(p, chosen, {signal, signal + n, signal + 3 * n}, p.r, block);
+    for (int64_t i = 0; i < n; ++i)
+      w[p.weight_pitch ? chosen.at[i] : chosen.at[i] % p.pitch] = weight[chosen.pixel[i]];
+    round(chosen, {row[4], row[5], row[7]}, p.z, block);
+    round(chosen, {row[0], row[1], row[3]}, p.r, block);
+    std::vector<float> v(p.height * p.pitch), sum(MOST * p.pitch);
     const auto project = [&](auto value) {  // Z W v
-      std::vector<float> v(p.height * p.pitch), lines(MOST * p.pitch);
-      for (int64_t i : chosen) v[at(p, i)] = value(i);
+      for (int64_t i = 0; i < n; ++i) v[chosen.at[i]] = value(i);
       Sums sums{};
       for (int64_t first = 0; first < p.height; first += BLOCK) {
-        products(t, p, first, std::min(BLOCK, p.height - first), v.data() + first * p.pitch, lines.data());
-        add_lines(t, p, lines.data(), sums);
+        products(t, p, first, std::min(BLOCK, p.height - first), v.data() + first * p.pitch, sum.data());
+        add_lines(t, p, sum.data(), sums);
       }
       return sums;
     };
-    const auto contrast = [&](int64_t i) { return signal[3 * n + i] - p.r.level; };
+    const auto contrast = [&](int64_t i) { return row[3][i] - p.r.level; };
     p.of_one = project([](int64_t) { return 1.f; });
     p.of_level = project(contrast);
     double square = 0;
-    for (int64_t i : chosen) square += double(weight[i]) * contrast(i) * contrast(i);
+    for (int64_t i = 0; i < n; ++i) square += double(weight[chosen.pixel[i]]) * contrast(i) * contrast(i);
     p.contrast = std::sqrt(std::max(square - p.of_level[4] * p.of_level[4] / p.of_one[4], 0.0));
-    const auto column = [&](int64_t k, int64_t i) {
-      const float x = float(p.left) + float(place(i, 0)), y = float(p.top) + float(place(i, 1));
-      const float light[] = {x, y, x * x, y * y, x * y};
-      return k < 3 ? signal[k * n + i] : k == 3 ? contrast(i) : k == 4 ? 1 : signal[3 * n + i] * light[k - 5];
+    const auto light = [&](int64_t k, int64_t i) {
+      const float x = float(p.left) + float(chosen.column[i]), y = float(p.top) + float(chosen.row[i]);
+      return k == 0 ? x : k == 1 ? y : k == 2 ? x * x : k == 3 ? y * y : x * y;
     };
     for (int64_t k = 0; k < p.columns; ++k) {
-      const Sums sums = project([&](int64_t i) { return column(k, i); });
+      const Sums sums = k == 3   ? p.of_level
+                        : k == 4 ? p.of_one
+                        : k < 3  ? project([&](int64_t i) { return row[k][i]; })
+                                 : project([&](int64_t i) { return row[3][i] * light(k - 5, i); });
       for (int64_t j = 0; j < p.columns; ++j) p.inverse[j][k] = sums[j];
     }
     invert(p.inverse, p.columns);
   }
 
-  at::Tensor pack() const {
+  at::Tensor pack() {
     int64_t bytes = (sizeof(Template) + 63) / 64 * 64;
     const Pixels whole = shape(all, true, bytes), thin = shape(some, false, bytes);
     const int64_t count = fields[K].size(0), n = fields[K].size(2);
