@@ -1,8 +1,9 @@
-"""Trackers side by side on one work: time and error of every one of them, frame by frame."""
+"""Trackers side by side on one work: time and error of every one of them."""
 
 from __future__ import annotations
 
 import math
+import random
 import statistics
 import time
 from typing import NamedTuple
@@ -12,11 +13,12 @@ from adapters import Peer
 from torch import Tensor
 from work import Work
 
+BLOCK = 6  # frames that one tracker follows before it is the next one's turn
 LOST_PX = 0.5  # a pose farther off than this, or none, is a lost frame
 
 
 class Result(NamedTuple):
-    """Of one tracker on one work: ``wall`` and processor time ``cpu``, s per frame (the first frame of each round left
+    """Of one tracker on one work: ``wall`` and processor time ``cpu``, s per frame (the first of each block left
     out), and ``error`` (n, 3) px, px, deg, NaN where it gave no pose."""
 
     wall: list[float]
@@ -58,19 +60,23 @@ class Result(NamedTuple):
 
 
 def measure(work: Work, peers: dict[str, Peer], frames: int) -> dict[str, Result]:
-    """All trackers through the frames side by side: each frame goes to every one of them before the next one comes."""
+    """All trackers through the frames side by side: in turns, each for BLOCK frames, in an order drawn anew each time.
+
+    The first frame of a block is not timed: in use nothing else has filled the caches between two frames.
+    """
     follow = {name: peer.start(work.frames[0], work.center, work.size) for name, peer in peers.items()}
     wall, cpu, error = ({name: [] for name in peers} for _ in range(3))
-    for k in range(min(frames, len(work.truth))):
-        names = [name for name, peer in peers.items() if k < peer.frames]
-        turn = k % max(len(names), 1)
-        for name in names[turn:] + names[:turn]:  # nobody always comes first
-            begun, worked = time.perf_counter(), time.process_time()
-            pose = follow[name](work.frames[k + 1])
-            wall[name].append(time.perf_counter() - begun)
-            cpu[name].append(time.process_time() - worked)
-            error[name].append(_error(pose, work.truth[k]))
-    return {name: Result(wall[name][1:], cpu[name][1:], torch.stack(error[name])) for name in peers}
+    frames = min(frames, len(work.truth))
+    for first in range(0, frames, BLOCK):
+        for name in random.Random(first).sample(list(peers), len(peers)):
+            for k in range(first, min(first + BLOCK, frames, peers[name].frames)):
+                begun, worked = time.perf_counter(), time.process_time()
+                pose = follow[name](work.frames[k + 1])
+                if k > first:
+                    wall[name].append(time.perf_counter() - begun)
+                    cpu[name].append(time.process_time() - worked)
+                error[name].append(_error(pose, work.truth[k]))
+    return {name: Result(wall[name], cpu[name], torch.stack(error[name])) for name in peers}
 
 
 def _error(pose: tuple[float, float, float] | None, truth: Tensor) -> Tensor:

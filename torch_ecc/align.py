@@ -59,8 +59,9 @@ def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings)
 
     Templates at the frame's border, where pixels drop out of sight, are few and take a slower way.
     """
-    if native.serves(reference, image, settings):
-        estimate, left = native.solve(reference, image, pose, settings)
+    templates = native.packed(reference, settings) if native.takes(image) else None
+    if templates is not None:
+        estimate, left = native.solve(templates, image, pose)
     else:
         estimate = solve_in_torch(reference, image, pose, settings)
         left = bool((estimate.status < 0).any())

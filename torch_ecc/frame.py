@@ -41,20 +41,21 @@ def as_image(where: str, name: str, image: object, device: torch.device | str | 
     alpha is dropped). Raises ValueError for any other shape or dtype, for an empty image and for NaN or infinity.
     """
     image = require_tensor(where, name, image)
-    shape = tuple(image.shape)
-    if image.dim() not in (2, 3, 4):
+    shape, dtype = tuple(image.shape), image.dtype
+    if len(shape) not in (2, 3, 4):
         raise ValueError(f"{where}: {name} must be (H, W), (C, H, W) or (B, C, H, W), got {shape}")
-    if image.dtype not in PIXEL_DTYPES:
-        raise ValueError(f"{where}: {name} must be uint8, uint16 or float, got {image.dtype}")
-    if image.numel() == 0:
+    if dtype not in PIXEL_DTYPES:
+        raise ValueError(f"{where}: {name} must be uint8, uint16 or float, got {dtype}")
+    if 0 in shape:
         raise ValueError(f"{where}: {name} must hold pixels, got the empty shape {shape}")
-    while image.dim() < 4:
-        image = image.unsqueeze(0)
-    if image.shape[1] not in (1, 3, 4):
+    channels = shape[-3] if len(shape) > 2 else 1
+    if channels not in (1, 3, 4):
         hint = " (channels last? use permute(2, 0, 1))" if shape[-1] in (1, 3, 4) else ""
         raise ValueError(f"{where}: {name} must have 1, 3 or 4 channels, got {shape}{hint}")
-    if image.shape[1] == 1 and not image.is_floating_point():
-        return image.to(device=device)
+    while image.dim() < 4:
+        image = image.unsqueeze(0)
+    if channels == 1 and not dtype.is_floating_point:
+        return image if device is None or image.device == device else image.to(device=device)
     gray = image.to(device=device, dtype=torch.float32)
     # The sum is finite exactly when all pixels are (no frame is large enough to overflow a float32 sum of grey
     # levels), and costs a thirtieth of isfinite().all().

@@ -17,6 +17,7 @@ import warnings
 import weakref
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -39,41 +40,53 @@ INSTRUCTIONS = {
 }
 
 
-def serves(reference: Reference, image: Tensor, settings: Settings) -> bool:
-    """Whether the native path takes this: its criterion, dtype and device, and it is asked for and can be had."""
-    return (
-        settings.backend != "torch"
-        and type(reference.criterion) in (ECC, SSD, PaperECC)
-        and image.device.type == "cpu"
-        and image.dtype in DTYPES
-        and load(settings.backend == "native")
-    )
+class Packed(NamedTuple):
+    """What the operators are called with: the templates (B, bytes) as the C++ reads them, and the settings."""
+
+    templates: Tensor
+    degree: int
+    max_iterations: int
+    tolerance: float
+    min_score: float
 
 
-def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> tuple[Estimate, int]:
+def takes(image: Tensor) -> bool:
+    """Whether the operators read such an image."""
+    return image.dtype in DTYPES and image.device.type == "cpu"
+
+
+def packed(reference: Reference, settings: Settings) -> Packed | None:
+    """Templates and settings for the operators; None if another path is asked for or needed."""
+    serves = type(reference.criterion) in (ECC, SSD, PaperECC) and reference.K.device.type == "cpu"
+    if settings.backend == "torch" or not serves or not load(settings.backend == "native"):
+        return None
+    degree = DEGREE[settings.interpolation]
+    return Packed(_pack(reference), degree, settings.max_iterations, settings.tolerance, settings.min_score)
+
+
+def solve(templates: Packed, image: Tensor, pose: Tensor) -> tuple[Estimate, int]:
     """Estimate of B templates in (B or 1, 1, H, W) of one of DTYPES, from poses (B, 3), and how many are left out.
 
     Those have status -1: at the frame's border, where pixels drop out of sight, the torch path is needed.
     """
-    operator = torch.ops.torch_ecc.solve.default
-    fields, left = operator(image, packed(reference), pose, *_options(settings))
+    fields, left = torch.ops.torch_ecc.solve.default(image, templates.templates, pose, *templates[1:])
     return Estimate(*fields), left
 
 
 def track(
-    reference: Reference, image: Tensor, state: list[Tensor], settings: Settings, *, hold: bool, search: bool
+    templates: Packed, image: Tensor, state: list[Tensor], *, hold: bool, search: bool
 ) -> tuple[Estimate | None, list[Tensor]]:
     """One frame of a Tracker of one level: its estimate and the next ``state`` = [pose, velocity, start, score,
     tracked, doubted]. The state is empty, the estimate that of ``solve``, if there are some to ``search`` for; None if
     the torch path is needed: for templates at the border."""
     operator = torch.ops.torch_ecc.track.default
-    fields = operator(image, packed(reference), state, *_options(settings), hold, search)
+    fields = operator(image, templates.templates, state, *templates[1:], hold, search)
     count = len(Estimate._fields)
     return Estimate(*fields[:count]) if fields else None, fields[count:]
 
 
-def packed(reference: Reference) -> Tensor:
-    """The templates (B, bytes) as the C++ reads them: 16-bit images, made once for as long as the reference lives."""
+def _pack(reference: Reference) -> Tensor:
+    """16-bit images (B, bytes) of the templates, made once for as long as the reference lives."""
     key, rest = id(reference.K), reference._replace(K=reference.sparse)  # what holds K would keep it alive
     known = _packed.get(key)
     if known is not None and known[0]() is reference.K and all(a is b for a, b in zip(known[1], rest, strict=True)):
@@ -84,10 +97,6 @@ def packed(reference: Reference) -> Tensor:
     forget = _packed.pop  # a module's names are gone when the interpreter ends
     _packed[key] = weakref.ref(reference.K, lambda _: forget(key, None)), rest, made
     return made
-
-
-def _options(settings: Settings) -> tuple[int | float, ...]:
-    return DEGREE[settings.interpolation], settings.max_iterations, settings.tolerance, settings.min_score
 
 
 @lru_cache(maxsize=2)

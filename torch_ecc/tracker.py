@@ -107,6 +107,7 @@ class Tracker(nn.Module):
         self.register_buffer("doubted", torch.zeros_like(start[:, 0], dtype=torch.int64))  # frames in a row
         self._locators: dict[int, Locator] = {}  # of the templates last searched for
         self._nearby: tuple[list[int], Nearby] | None = None
+        self._packed: tuple[native.Packed | None] | None = None  # once it is known whether the native path serves
         self._turn = 0  # whose turn it is if they are many
 
     @classmethod
@@ -135,10 +136,9 @@ class Tracker(nn.Module):
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
         self.references = [reference.map(lambda tensor: tensor.to(device)) for reference in self.references]
         self._locators.clear()
-        self._nearby = None
+        self._nearby = self._packed = None
         return self
 
-    @torch.no_grad()
     def forward(self, frame: Tensor) -> Estimate:
         """Poses of all R templates in the next ``frame``, of the same size as the first: Estimate (R, ...).
 
@@ -148,18 +148,7 @@ class Tracker(nn.Module):
         if image.shape != self.frame_shape:
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
         estimate, done = self._at_once(image)
-        if estimate is not None and done:
-            return estimate
-        images, start = [image.float()], compose(self.pose, self.velocity)
-        if estimate is None:
-            estimate = self._solve(images, start)
-        due = self._due(self._strange(estimate)) if self.search else []
-        if due:
-            estimate = self._look_near(images[0], estimate, start, sorted(due))
-            strange = self._strange(estimate).tolist()
-            for r in [r for r in due if strange[r]][:AT_ONCE]:
-                estimate = self._search(images, estimate, r)
-        return self._advance(estimate)
+        return estimate if estimate is not None and done else self._beyond(image, estimate)
 
     def track(self, frame: Tensor) -> Estimate:
         """Same as calling the tracker."""
@@ -183,13 +172,31 @@ class Tracker(nn.Module):
     def _at_once(self, image: Tensor) -> tuple[Estimate | None, bool]:
         """Prediction, solve and update in one native call, and whether that is all that this frame needs: without the
         update if some are to be searched for, None where the native path does not serve."""
-        if self.levels > 1 or not native.serves(self.references[0], image, self.settings):
+        if self.levels > 1 or not native.takes(image):
+            return None, False
+        if self._packed is None:
+            self._packed = (native.packed(self.references[0], self.settings),)
+        if self._packed[0] is None:
             return None, False
         state: list[Any] = [self._buffers[name] for name in STATE]  # a module's attributes are slow
         hold = self.prediction == "hold"
-        estimate, state = native.track(self.references[0], image, state, self.settings, hold=hold, search=self.search)
+        estimate, state = native.track(self._packed[0], image, state, hold=hold, search=self.search)
         self._buffers.update(zip(STATE, state, strict=False))  # none, if some are to be searched for
         return estimate, bool(state)
+
+    @torch.no_grad()
+    def _beyond(self, image: Tensor, estimate: Estimate | None) -> Estimate:
+        """What a frame needs more: the torch path if there is no ``estimate`` yet, and searches."""
+        images, start = [image.float()], compose(self.pose, self.velocity)
+        if estimate is None:
+            estimate = self._solve(images, start)
+        due = self._due(self._strange(estimate)) if self.search else []
+        if due:
+            estimate = self._look_near(images[0], estimate, start, sorted(due))
+            strange = self._strange(estimate).tolist()
+            for r in [r for r in due if strange[r]][:AT_ONCE]:
+                estimate = self._search(images, estimate, r)
+        return self._advance(estimate)
 
     def _solve(self, images: list[Tensor], pose: Tensor) -> Estimate:
         """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are.

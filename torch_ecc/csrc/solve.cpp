@@ -140,3 +140,7 @@ TORCH_LIBRARY_IMPL(torch_ecc, CPU, m) {
   m.impl("solve", &solve);
   m.impl("track", &track);
 }
+
+TORCH_LIBRARY_IMPL(torch_ecc, Autograd, m) {  // nothing here has a gradient: no time is spent on the question
+  for (const char* name : {"pack", "solve", "track"}) m.impl(name, torch::CppFunction::makeFallthrough());
+}
