@@ -85,8 +85,7 @@ struct Packer {
     p.pitch = padded(p.width);
     for (int64_t i = 0; i < chosen.size(); ++i)
       chosen.at.push_back(chosen.row[i] / step * p.pitch + chosen.column[i] / step);
-    const bool even = fields[WEIGHT].size(0) == 1 && chosen.size() == p.width * p.height &&
-                      fields[WEIGHT].eq(1).all().item<bool>();
+    const bool even = chosen.size() == p.width * p.height && fields[WEIGHT].eq(1).all().item<bool>();
     p.weight_pitch = even ? 0 : p.pitch;  // one row serves if all are alike
     const auto take = [&](int64_t bytes) { return std::exchange(end, (end + bytes + 63) / 64 * 64); };
     p.weight = take(4 * p.pitch * (even ? 1 : p.height));

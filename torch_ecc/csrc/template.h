@@ -53,7 +53,10 @@ inline Vector row_of(const Pixels& p) {
 // v where it has weight; elsewhere it may be anything, NaN too: whole vectors reach beyond what has been sampled.
 inline Vector counted(const float* v, const Vector& weight) { return weight > 0 ? load<Vector>(v) : Vector{}; }
 
-inline Vector wide(const int16_t* from) { return __builtin_convertvector(load<Shorts>(from), Vector); }
+// By way of whole vectors of 32 bits, which compilers would otherwise take apart.
+inline Vector wide(const int16_t* from) {
+  return __builtin_convertvector(__builtin_convertvector(load<Shorts>(from), Ints), Vector);
+}
 
 // Asks for a row of blocks from memory ahead of its use: too many rows at once for the processor to guess them.
 inline void fetch(const Template& t, const Pixels& p, const Images& images, int64_t first) {
@@ -63,44 +66,49 @@ inline void fetch(const Template& t, const Pixels& p, const Images& images, int6
 }
 
 // lines (5 + light, pitch) = sums over `rows` rows from `first` on of each column of Z times w v. v: (rows, pitch)
-template <int light>
+// x is the same down a column of pixels: it is left to the end. even: one row of weights serves for all.
+template <int light, bool even>
 void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, float* lines) {
   const int16_t *zx = t.at<int16_t>(p.z.at[0]), *zy = t.at<int16_t>(p.z.at[1]), *zt = t.at<int16_t>(p.z.at[2]);
-  const float* weight = t.at<float>(p.weight);
-  const float level = p.z.level / p.z.grey, step = float(p.step);
+  const float* weight = t.at<float>(p.weight) + first * p.weight_pitch;
+  const float level = p.z.level / p.z.grey, step = float(p.step), top = float(p.top + double(first) * p.step);
   Vector x = row_of(p);
   for (int64_t i = 0; i < p.pitch; i += LANES, x += LANES * step) {
-    Vector sum[5 + light] = {};
+    Vector gx{}, gxy{}, gy{}, grey{}, greyy{}, greyyy{}, all{}, ally{}, allyy{}, w = load<Vector>(weight + i);
     for (int64_t j = 0; j < rows; ++j) {
       const int64_t at = (first + j) * p.pitch + i;
-      const float y = float(p.top + double(first + j) * p.step);
-      const Vector w = load<Vector>(weight + (first + j) * p.weight_pitch + i);
-      const Vector wv = w * counted(v + j * p.pitch + i, w);
-      const Vector gx = wide(zx + at) * wv, gy = wide(zy + at) * wv, blurred = wide(zt + at), grey = blurred * wv;
-      sum[0] += gx;
-      sum[1] += gy;
-      sum[2] += gx * y - gy * x;
-      sum[3] += grey;
-      sum[4] += wv;
+      const float y = top + float(j) * step;
+      if constexpr (!even) w = load<Vector>(weight + j * p.weight_pitch + i);
+      const Vector wv = w * counted(v + j * p.pitch + i, w), dx = wide(zx + at) * wv, bright = wide(zt + at) * wv;
+      gx += dx;
+      gxy += dx * y;
+      gy += wide(zy + at) * wv;
+      grey += bright;
+      all += wv;
       if constexpr (light > 0) {
-        const Vector tx = (grey + level * wv) * x, ty = (grey + level * wv) * y;
-        sum[5] += tx;
-        sum[6] += ty;
-        if constexpr (light > 2) {
-          sum[7] += tx * x;
-          sum[8] += ty * y;
-          sum[9] += tx * y;
-        }
+        greyy += bright * y;
+        ally += wv * y;
+      }
+      if constexpr (light > 2) {
+        greyyy += bright * (y * y);
+        allyy += wv * (y * y);
       }
     }
+    const Vector ty = greyy + level * ally, tx = (grey + level * all) * x;
+    const Vector sum[] = {gx, gy, gxy - gy * x, grey, all, tx, ty, tx * x, greyyy + level * allyy, ty * x};
     for (int k = 0; k < 5 + light; ++k) store(sum[k], lines + k * p.pitch + i);
   }
 }
 
+template <bool even>
+void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, float* lines) {
+  if (t.light() == 0) products<0, even>(t, p, first, rows, v, lines);
+  if (t.light() == 2) products<2, even>(t, p, first, rows, v, lines);
+  if (t.light() == 5) products<5, even>(t, p, first, rows, v, lines);
+}
+
 inline void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, float* lines) {
-  if (t.light() == 0) products<0>(t, p, first, rows, v, lines);
-  if (t.light() == 2) products<2>(t, p, first, rows, v, lines);
-  if (t.light() == 5) products<5>(t, p, first, rows, v, lines);
+  p.weight_pitch ? products<false>(t, p, first, rows, v, lines) : products<true>(t, p, first, rows, v, lines);
 }
 
 inline void add_lines(const Template& t, const Pixels& p, const float* lines, Sums& sums) {

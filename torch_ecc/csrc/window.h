@@ -14,6 +14,7 @@ constexpr int LANES = 16;
 constexpr int LANES = 8;
 #endif
 typedef float Vector __attribute__((vector_size(4 * LANES)));
+typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
 typedef int16_t Shorts __attribute__((vector_size(2 * LANES)));
 
 template <class V, class T>
