@@ -157,6 +157,17 @@ def test_a_tracker_follows_the_same_path(options):
     assert (tracks[0].pose - tracks[1].pose).abs().max() < 2e-4
 
 
+@compiled
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf"), 1e300])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_pose_that_is_nowhere_is_left_to_the_torch_path(place, wrong):
+    prepared, image, start = problems_of_many()._replace(count=1).made(ECC())
+    start[0, place] = wrong
+    estimate, left = native.solve(native.packed(prepared, Settings()), image, start)
+    settled = place == 2 and wrong == 1e300  # an angle like any other
+    assert settled or (left == 1 and estimate.status == -1)
+
+
 def test_without_a_compiler_torch_serves(tmp_path):
     """One clear line if the native path was asked for, none otherwise, and the same answer."""
     code = """

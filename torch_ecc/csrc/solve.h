@@ -57,8 +57,10 @@ inline void bounds(const Template& t, const Warp& w, double (&low)[2], double (&
   }
 }
 
+// False for NaN, which compares as neither here nor there: no place in memory could be made of it.
 inline bool inside(const Template& t, const double (&pose)[3], const Frame& frame, double margin) {
   double low[2], high[2];
+  if (!std::isfinite(pose[0]) || !std::isfinite(pose[1]) || !std::isfinite(pose[2])) return false;
   bounds(t, warp_of(pose), low, high);
   return low[0] >= margin && low[1] >= margin && high[0] <= double(frame.w - 1) - margin &&
          high[1] <= double(frame.h - 1) - margin;
