@@ -158,6 +158,21 @@ def test_a_tracker_follows_the_same_path(options):
 
 
 @compiled
+@pytest.mark.parametrize("criterion", [ECC(), SSD(), PaperECC()])
+def test_a_mask_of_every_second_pixel(criterion):
+    """Pixels two apart are where they are: score, residual and sigma are those of the torch path."""
+    mask = torch.zeros(31, 31)
+    mask[::2, ::2] = 1
+    prepared, image, start = problems_of_many()._replace(size=(31, 31), count=1).made(ECC())
+    template = SCENE.render(torch.tensor([[15.0, 15.0, 0.0]], dtype=torch.float64), (31, 31))
+    prepared = prepare(template, criterion=criterion, mask=mask)
+    fast, slow = (align(prepared, image, start, backend=backend) for backend in ("native", "torch"))
+    assert torch.equal(fast.status, slow.status)
+    torch.testing.assert_close(fast.residual_rms, slow.residual_rms, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(fast.sigma, slow.sigma, rtol=1e-2, atol=0)
+
+
+@compiled
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf"), 1e300])
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_a_pose_that_is_nowhere_is_left_to_the_torch_path(place, wrong):

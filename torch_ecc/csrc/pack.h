@@ -78,7 +78,7 @@ struct Packer {
       p.width = std::max(p.width, chosen.column[i] + 1);
       p.height = std::max(p.height, chosen.row[i] + 1);
     }
-    step = std::max<int64_t>(step, 1);
+    step = whole ? 1 : std::max<int64_t>(step, 1);  // the whole of a mask with gaps counts in px, gaps and all
     p.width = (p.width + step - 1) / step;
     p.height = (p.height + step - 1) / step;
     p.step = double(step);
