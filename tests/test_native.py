@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -170,6 +171,18 @@ def test_a_mask_of_every_second_pixel(criterion):
     assert torch.equal(fast.status, slow.status)
     torch.testing.assert_close(fast.residual_rms, slow.residual_rms, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(fast.sigma, slow.sigma, rtol=1e-2, atol=0)
+
+
+@compiled
+@pytest.mark.parametrize("size", [21, 150])
+def test_packed_templates_go_with_their_reference(size):
+    known, frame = set(native._packed), torch.rand(1, 1, 200, 200)
+    tracker = Tracker(frame, [(100, 100)], size, backend="native")
+    tracker.track(frame)
+    assert set(native._packed) - known
+    del tracker
+    gc.collect()
+    assert not set(native._packed) - known
 
 
 @compiled

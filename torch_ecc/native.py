@@ -31,7 +31,7 @@ SOURCES = Path(__file__).parent / "csrc"
 DEGREE = {"bilinear": 1, "bspline3": 3, "bspline5": 5}
 CODE: dict[type[Criterion], int] = {SSD: -1, PaperECC: -2}  # beside ECC's number of light columns
 DTYPES = (torch.uint8, torch.uint16, torch.float32)
-_packed: dict[int, tuple[weakref.ref[Tensor], Reference, Tensor]] = {}  # by the id of K
+_packed: dict[int, tuple[weakref.ref[Tensor], tuple[object, ...], Tensor]] = {}  # by the id of K
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.
 MATHS = ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"]
 INSTRUCTIONS = {
@@ -87,9 +87,10 @@ def track(
 
 def _pack(reference: Reference) -> Tensor:
     """16-bit images (B, bytes) of the templates, made once for as long as the reference lives."""
-    key, rest = id(reference.K), reference._replace(K=reference.sparse)  # what holds K would keep it alive
+    rest = tuple(v for v in reference if v is not reference.K)  # what holds K, as K_sparse too, would keep it alive
+    key = id(reference.K)
     known = _packed.get(key)
-    if known is not None and known[0]() is reference.K and all(a is b for a, b in zip(known[1], rest, strict=True)):
+    if known is not None and known[0]() is reference.K and [*map(id, known[1])] == [*map(id, rest)]:
         return known[2]
     criterion = reference.criterion
     code = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else CODE[type(criterion)]
