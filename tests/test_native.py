@@ -196,6 +196,14 @@ def test_a_pose_that_is_nowhere_is_left_to_the_torch_path(place, wrong):
     assert settled or (left == 1 and estimate.status == -1)
 
 
+@compiled
+def test_templates_of_float32_poses_take_the_torch_path():
+    """As they come from a device without float64."""
+    prepared, image, start = problems_of_many()._replace(count=1).made(ECC())
+    single = prepared.map(lambda v: v.float() if v.dtype == torch.float64 else v)
+    assert (align(single, image, start).pose - align(prepared, image, start).pose).abs().max() < 1e-3
+
+
 def test_without_a_compiler_torch_serves(tmp_path):
     """One clear line if the native path was asked for, none otherwise, and the same answer."""
     code = """

@@ -58,6 +58,7 @@ def takes(image: Tensor) -> bool:
 def packed(reference: Reference, settings: Settings) -> Packed | None:
     """Templates and settings for the operators; None if another path is asked for or needed."""
     serves = type(reference.criterion) in (ECC, SSD, PaperECC) and reference.K.device.type == "cpu"
+    serves = serves and reference.radius.dtype == torch.float64  # float32 where it was prepared on Apple's MPS
     if settings.backend == "torch" or not serves or not load(settings.backend == "native"):
         return None
     degree = DEGREE[settings.interpolation]
