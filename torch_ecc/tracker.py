@@ -139,6 +139,10 @@ class Tracker(nn.Module):
         self._nearby = self._packed = None
         return self
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Packed templates are of use to the native library of this process and this kind of CPU alone.
+        return {**self.__dict__, "_packed": None}
+
     def forward(self, frame: Tensor) -> Estimate:
         """Poses of all R templates in the next ``frame``, of the same size as the first: Estimate (R, ...).
 
