@@ -205,3 +205,9 @@ def test_many_templates_are_prepared_in_portions(monkeypatch, masked, some):
     portions = prepare(templates, mask=mask)
     for name, whole, part in zip(Reference._fields[1:], together[1:], portions[1:], strict=True):
         torch.testing.assert_close(part, whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max()), msg=name)
+
+
+def test_select_keeps_the_order_asked_for():
+    reference = prepare(torch.rand(3, 1, 9, 9))
+    for order in ([2, 0, 1], [1, 1, 1], [0, 1, 2], [2]):
+        assert torch.equal(reference.select(torch.tensor(order)).K, reference.K[order])

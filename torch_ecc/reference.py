@@ -103,7 +103,7 @@ class Reference(NamedTuple):
 
     def select(self, index: Tensor | slice) -> Reference:
         """The reference of the templates at ``index`` (n,); of a slice without a copy."""
-        if isinstance(index, Tensor) and len(index) == len(self.K):
+        if isinstance(index, Tensor) and index.tolist() == list(range(len(self.K))):
             return self
         shared = _shared(len(self.weight))
         return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))
