@@ -13,7 +13,7 @@ namespace ecc {
 enum Field { PIXELS, BOX, BLOCKS, BLOCK_SIZES, CENTRE, RADIUS, NOISE, SIGNAL, INSTRUMENT, TRUST, WEIGHT, ALIAS, K, SLOPE,
              SPREAD, INFLATION, SPREAD_NOISE, SHARE, SPARSE, K_SPARSE };
 
-// Gauss-Jordan, with rows and columns brought to unit diagonal first; zero if singular.
+// criteria.safe_inverse by Gauss-Jordan, with rows and columns brought to unit diagonal; zero if singular to float32.
 inline void invert(double (&matrix)[MOST][MOST], int64_t n) {
   double scale[MOST], wide[MOST][2 * MOST] = {};
   for (int64_t i = 0; i < n; ++i) scale[i] = 1 / std::sqrt(std::max(std::abs(matrix[i][i]), 1e-300));
@@ -31,11 +31,15 @@ inline void invert(double (&matrix)[MOST][MOST], int64_t n) {
     for (int64_t i = 0; i < n; ++i)
       for (int64_t j = 2 * n - 1; i != k && j >= k; --j) wide[i][j] -= wide[i][k] * wide[k][j];
   }
+  double size = 0;
+  bool regular = true;
+  for (int64_t i = 0; i < n; ++i) {
+    regular = regular && matrix[i][i] > 0;
+    for (int64_t j = 0; j < n; ++j) size += std::abs(wide[i][n + j]);
+  }
+  regular = regular && size < 1e6;  // NaN and infinity compare as singular
   for (int64_t i = 0; i < n; ++i)
-    for (int64_t j = 0; j < n; ++j) {
-      const double value = wide[i][n + j] * scale[i] * scale[j];
-      matrix[i][j] = std::isfinite(value) ? value : 0;
-    }
+    for (int64_t j = 0; j < n; ++j) matrix[i][j] = regular ? wide[i][n + j] * scale[i] * scale[j] : 0;
 }
 
 struct Grid {  // chosen pixels of a template: numbers, and columns and rows in its bounding box
