@@ -58,7 +58,7 @@ class Bank(NamedTuple):
             weights = _disc_image(reach, radius).to(weights)[None]
             texture = texture * weights
         texture, planes = _orthonormal(texture, weights)
-        shape = (_fast(size[0] + 2 * reach), _fast(size[1] + 2 * reach))
+        shape = (fast_length(size[0] + 2 * reach), fast_length(size[1] + 2 * reach))
         spectra = (torch.fft.rfft2(kernel, s=shape).conj_physical() for kernel in (texture, planes, weights))
         local = offset.to(reference.radius.dtype) - reference.centre[0].to(reference.radius.dtype)
         return Bank(size, shape, reach, local, turns, *spectra)
@@ -107,7 +107,7 @@ def details(reference: Reference, image: Tensor, turns: Tensor, most: int) -> Te
     """
     template, weight, corner = as_images(reference)
     reach = math.ceil(math.hypot(*template.shape[-2:]) / 2)
-    (h, w), size = image.shape, [_fast(max(n, 2 * reach + 1)) for n in image.shape]
+    (h, w), size = image.shape, [fast_length(max(n, 2 * reach + 1)) for n in image.shape]
     spectrum = torch.fft.rfft2(image - image.mean(), s=size)
     lags = (torch.fft.fftfreq(n, 1 / n, device=image.device).abs() for n in size)
     rows, columns = (F.relu(1 - lag / max(template.shape[-2:])) for lag in lags)
@@ -247,7 +247,7 @@ def _orthonormal(texture: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return texture / norm.clamp(min=1e-30), planes
 
 
-def _fast(n: int) -> int:
+def fast_length(n: int) -> int:
     """The next even number of factors 2, 3 and 5: transforms of it are fast."""
 
     def smooth(m: int) -> bool:

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.align import solve
-from torch_ecc.bank import SMALLEST_SEARCHED
+from torch_ecc.bank import SMALLEST_SEARCHED, fast_length
 from torch_ecc.criteria import safe_inverse
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.pose import compose, rotation
@@ -62,7 +62,8 @@ class Nearby(NamedTuple):
         texture, weights = _turned(texture, weights, _turns(reference.radius.to(template)))
         reach = 2 * math.ceil(FARTHEST / step) + 2
         shape = (texture.shape[-2] + reach, texture.shape[-1] + reach)
-        spectra = (torch.fft.rfft2(kernel, s=_fast(shape)).conj_physical() for kernel in (texture, weights))
+        size = [fast_length(n) for n in shape]
+        spectra = (torch.fft.rfft2(kernel, s=size).conj_physical() for kernel in (texture, weights))
         return Nearby(step, shape, middle.to(reference.radius), *spectra)
 
     def find(self, reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
@@ -89,7 +90,7 @@ class Nearby(NamedTuple):
         """Where ``image`` (1 or B, 1, H, W) looks most like the templates around ``pose`` (B, 3): (B, TRIED, 3), the
         best first, and the correlations (B, TRIED)."""
         g = self._surroundings(image, pose)
-        shape = _fast(self.shape)
+        shape = [fast_length(n) for n in self.shape]
         spectra = torch.fft.rfft2(torch.stack((g, g * g), 1), s=shape)
         reach = 2 * math.ceil(FARTHEST / self.step) + 3
         match, average = (
@@ -156,11 +157,6 @@ def _tells(texture: Tensor, weights: Tensor, template: Tensor, weight: Tensor, s
     density = 4 * math.pi * (step**2 - 1) / 3 * kept / full.clamp(min=1e-12)
     count = (weight > 0).sum((1, 2, 3)) / step**2
     return bool((density >= LEAST_DENSITY).all() & (count >= SMALLEST_SEARCHED**2).all())
-
-
-def _fast(shape: tuple[int, int]) -> tuple[int, int]:
-    """The next multiples of 8: transforms of primes take five times as long."""
-    return -(-shape[0] // 8) * 8, -(-shape[1] // 8) * 8
 
 
 def _turns(like: Tensor) -> Tensor:

@@ -75,8 +75,7 @@ inline void read(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t 
 }
 
 // Samples to coefficients of the interpolating B-spline, one pole z of the inverse filter after the other (Unser et
-// al., 1993, I). `start` px from
-// a border it is forgotten.
+// al., 1993, I). `start` px from a border it is forgotten.
 template <int degree>
 struct Prefilter {
   static constexpr int poles = degree / 2, start = degree == 3 ? 15 : 18;
