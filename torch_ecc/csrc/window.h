@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <utility>
 #include <vector>
 
 namespace ecc {
@@ -22,6 +23,21 @@ V load(const T* from) {
   V values;
   std::memcpy(&values, from, sizeof values);
   return values;
+}
+
+// The values from the n-th of `a` on, continued by those of `b`.
+template <int n, int... k>
+Vector after(const Vector& a, const Vector& b, std::integer_sequence<int, k...>) {
+#ifdef __clang__
+  return __builtin_shufflevector(a, b, (k + n)...);
+#else
+  return __builtin_shuffle(a, b, Ints{(k + n)...});
+#endif
+}
+
+template <int n>
+Vector after(const Vector& a, const Vector& b) {
+  return after<n>(a, b, std::make_integer_sequence<int, LANES>());
 }
 
 inline void store(const Vector& values, float* to) { std::memcpy(to, &values, sizeof values); }
@@ -75,10 +91,12 @@ inline void read(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t 
 }
 
 // Samples to coefficients of the interpolating B-spline, one pole z of the inverse filter after the other (Unser et
-// al., 1993, I). `start` px from a border it is forgotten.
+// al., 1993, I).
 template <int degree>
 struct Prefilter {
-  static constexpr int poles = degree / 2, start = degree == 3 ? 15 : 18;
+  static constexpr int poles = degree / 2;
+  // px from where reading begins to where that is forgotten, along rows and down columns
+  static constexpr int64_t start = degree == 3 ? 15 : 18, above = degree == 3 ? 12 : 18;
 
   static double pole(int p) {
     const double inner = std::sqrt(17745.0 / 4), outer = std::sqrt(105.0 / 4);
@@ -86,70 +104,76 @@ struct Prefilter {
     return p == 0 ? std::sqrt(67.5 - inner) + outer - 6.5 : std::sqrt(67.5 + inner) - outer - 6.5;
   }
 
-  // Down the columns, recursively from both ends, started as if the border went on; `pitch` a multiple of 4 LANES.
+  // out = now * row + before * last, (pitch,) each.
+  static void recur(const float* row, float now, const float* last, float before, int64_t pitch, float* out) {
+    for (int64_t i = 0; i < pitch; i += LANES)
+      store(now * load<Vector>(row + i) + before * load<Vector>(last + i), out + i);
+  }
+
+  // Down the columns and up again, recursively, started as if the border went on.
   static void columns(float* values, int64_t h, int64_t pitch) {
-    constexpr int SIDE = 4;  // vectors side by side: one alone would wait for itself
+    float* const end = values + (h - 1) * pitch;
     for (int p = 0; p < poles; ++p) {
-      const float z = float(pole(p)), rest = 1 - z, gain = rest * rest;
-      for (int64_t i = 0; i < pitch; i += SIDE * LANES) {
-        Vector last[SIDE];
-        const auto go = [&](int64_t j, float now, float before) {
-          for (int k = 0; k < SIDE; ++k) {
-            float* const at = values + j * pitch + i + k * LANES;
-            last[k] = now * load<Vector>(at) + before * last[k];
-            store(last[k], at);
-          }
-        };
-        for (int k = 0; k < SIDE; ++k) last[k] = load<Vector>(values + i + k * LANES) * rest;
-        for (int64_t j = 0; j < h; ++j) go(j, gain, z);
-        for (int k = 0; k < SIDE; ++k) last[k] = load<Vector>(values + (h - 1) * pitch + i + k * LANES) / rest;
-        for (int64_t j = h - 1; j >= 0; --j) go(j, 1, z);
-      }
+      const float z = float(pole(p)), rest = 1 - z;
+      recur(values, rest, values, 0, pitch, values);
+      for (float* at = values + pitch; at <= end; at += pitch) recur(at, rest * rest, at - pitch, z, pitch, at);
+      recur(end, 1 / rest, end, 0, pitch, end);
+      for (float* at = end - pitch; at >= values; at -= pitch) recur(at, 1, at + pitch, z, pitch, at);
     }
   }
 
-  // Along a row of w + 2 start values, which it overwrites: 1 / ((1 - z S) (1 - z / S)), S a shift by one px, is the
-  // product over m = 1, 2, 4 ... of (1 + z^m S^m) (1 + z^m / S^m), so that each factor takes three values.
+  // Along the rows 1 / ((1 - z S) (1 - z / S)), S a shift by one px, is the product over m = 1, 2, 4 ... of
+  // (1 + z^m S^m) (1 + z^m / S^m), so that each factor takes three values: the first where they lie in memory, the
+  // others, one after the other, in registers.
+  template <int m>
   struct Factor {
-    int m;
     float middle, side;
+    Vector before{}, now{};
+
+    Factor(int p, int last) {  // z^(2 last) is left out
+      const double power = std::pow(pole(p), m), gain = std::pow((1 - pole(p)) / (1 - std::pow(pole(p), 2 * last)), 2);
+      middle = float((m == 1 ? gain : 1) * (1 + power * power));
+      side = float((m == 1 ? gain : 1) * power);
+    }
+
+    Vector operator()(const Vector& next) {  // of the vector before this one
+      const Vector sides = after<LANES - m>(before, now) + after<m>(now, next), out = middle * now + side * sides;
+      before = now;
+      now = next;
+      return out;
+    }
   };
 
-  static std::vector<Factor> factors() {
-    std::vector<Factor> all;
-    for (int p = 0; p < poles; ++p) {
-      const int last = p == 0 ? 8 : 2;  // z^(2 last) is left out
-      double power = pole(p), gain = std::pow((1 - power) / (1 - std::pow(power, 2 * last)), 2);
-      for (int m = 1; m <= last; m *= 2, power *= power, gain = 1)
-        all.push_back({m, float(gain * (1 + power * power)), float(gain * power)});
-    }
-    return all;
-  }
-
-  static void row(const std::vector<Factor>& factors, float* a, float* b, int64_t w, float* out) {
-    int64_t first = 0, last = w + 2 * start;
-    for (const Factor& f : factors) {
-      first += f.m;
-      last -= f.m;
-      if (&f == &factors.back()) b = out - start, first = start, last = start + w;
-      for (int64_t i = first; i < last; i += LANES) {
-        const Vector sides = load<Vector>(a + i - f.m) + load<Vector>(a + i + f.m);
-        store(f.middle * load<Vector>(a + i) + f.side * sides, b + i);
+  static void row(const float* from, int64_t n, float* out) {
+    static const Factor<1> first(0, 8), e(1, 2);
+    static const Factor<2> b(0, 8), f(1, 2);
+    static const Factor<4> c(0, 8);
+    static const Factor<8> d(0, 8);
+    const auto go = [&](auto... factors) {
+      for (int64_t i = 0; i < n + int64_t(sizeof...(factors)) * LANES; i += LANES) {
+        const Vector sides = load<Vector>(from + i - 1) + load<Vector>(from + i + 1);
+        Vector value = first.middle * load<Vector>(from + i) + first.side * sides;
+        ((value = factors(value)), ...);
+        const int64_t at = i - int64_t(sizeof...(factors)) * LANES;
+        if (at >= 0) store(value, out + at);
       }
-      std::swap(a, b);
-    }
+    };
+    if constexpr (degree == 3)
+      go(b, c, d);
+    else
+      go(b, c, d, e, f);
   }
 
   static void fill(const Frame& frame, Window& window) {
-    const int64_t wide = window.w + 2 * start, high = window.h + 2 * start;
-    const int64_t pitch = (wide + 5 * LANES) / (4 * LANES) * (4 * LANES);  // at least a vector is spare
-    window.raw.resize(pitch * high + 4 * LANES);
-    window.line.resize(pitch + 4 * LANES);  // rows are worked on in whole vectors, beyond their ends
-    read(frame, window.x0 - start, window.y0 - start, wide, high, pitch, true, window.raw.data());
+    const int64_t high = window.h + 2 * above, pitch = padded(window.w + 2 * start);
+    window.raw.resize(pitch * high);
+    read(frame, window.x0 - start, window.y0 - above, window.w + 2 * start, high, pitch, true, window.raw.data());
     columns(window.raw.data(), high, pitch);
-    static const std::vector<Factor> all = factors();
-    for (int64_t j = 0; j < window.h; ++j)
-      row(all, window.raw.data() + (start + j) * pitch, window.line.data(), window.w, window.values.data() + j * window.pitch());
+    window.line.resize(pitch + LANES);
+    for (int64_t j = 0; j < window.h; ++j) {
+      row(window.raw.data() + (above + j) * pitch, start + window.w, window.line.data());
+      std::copy_n(window.line.data() + start, window.w, window.values.data() + j * window.pitch());
+    }
   }
 };
 
