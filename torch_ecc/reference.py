@@ -31,7 +31,7 @@ from torch_ecc.sampling import aliasing, blur, gradients, pad
 
 ALIASING = ("bilinear", "bspline3")  # samplers whose own error counts; that of bspline5 does not
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
-ENOUGH = 3000  # pixels of a template tell well where to go; the first iterations leave out others in x and y
+ENOUGH = 1500  # pixels of a template tell well where to go; the first iterations leave out others in x and y
 SPARSEST = 4  # px between those that are kept
 BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
 PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which takes some 600 bytes on the way

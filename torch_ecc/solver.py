@@ -138,10 +138,13 @@ def secant(state: State, delta: Any, length: Any) -> tuple[Any, Any]:
 
     Noise in the template shortens every step by one factor, so that steps shrink in a geometric series. Two of them
     tell its sum (the secant method on their common line). Only near the answer, where steps are such a series, and
-    within one stage: another sampler or other pixels have another answer, to which the first step is no part of it.
+    within one stage: another sampler or other pixels have another answer, to which the first step is no part of it. Of
+    that step the earlier stage tells what it leaves: the share that its steps did not cover.
     """
     xp, last = library(delta), norm(state.delta)
-    rate = xp.where(last > 0, length / last, 0.5).clip(0.05, 0.95)
+    first = ~(state.error < xp.inf)
+    rate = xp.where(last > 0, length / last, 0.5)
+    rate = xp.where(first & (state.factor > 1), 1 - 1 / state.factor, rate).clip(0.05, 0.95)
     along = (state.delta * delta).sum(-1) / (last * last)  # = 1 - (last stretch) * (share that a step covers)
     usable = (last < SECANT_RANGE) & (along < 0.9) & (state.error < xp.inf)
     return xp.where(usable, (state.factor / (1 - along)).clip(1.0, LARGEST_STRETCH), 1.0), rate
