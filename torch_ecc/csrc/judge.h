@@ -52,68 +52,59 @@ inline bool safe_inverse(const Matrix& matrix, Matrix& inverse) {
 }
 
 struct Remains {  // of a patch v after the fit, and before it: weighted sums, and what K's rows make of the rest
-  double square = 0, v = 0, vv = 0, vt = 0;  // of the rest squared; of v, v^2 and v (t - level)
-  double clustered[3] = {0, 0, 0};           // of the squared sums over blocks
+  double square, v, vv, vt;  // of the rest squared; of v, v^2 and v (t - level)
+  double clustered[3];       // of the squared sums over blocks
 };
 
-// One pass over the patch, a row of blocks at a time.
+// From the sums of the last look, r = v - R^T model, and the fit e = r - R^T change. What e has along G is nothing but
+// chance, as it is nothing along Z; along the other columns it is known.
 inline Remains remains(const Template& t, Scratch& scratch) {
   const Pixels& p = t.whole;
-  const int16_t* rt = t.at<int16_t>(p.r.at[2]);
-  const float* weight = t.at<float>(p.weight);
-  float *const lines = scratch.lines.data(), *const rest = lines + MOST * p.pitch;
-  float* const starts = rest + BLOCK * p.pitch;  // 1 where a block of columns begins, 0 elsewhere
-  for (int64_t i = 0; i < p.pitch; ++i) starts[i] = 0;
-  for (int64_t i = 0; i < p.width; i += BLOCK) starts[i] = 1;
-  Remains out;
-  for (int64_t first = 0; first < p.height; first += BLOCK) {
-    const int64_t rows = std::min(BLOCK, p.height - first);
-    const float* const patch = scratch.patch.data() + first * p.pitch;
-    fetch(t, p, p.r, first + BLOCK);
-    residual(t, first, rows, scratch.u, patch, rest);
-    Vector sums[4] = {};
-    for (int64_t j = 0; j < rows; ++j)
-      for (int64_t i = 0; i < p.pitch; i += LANES) {
-        const Vector w = load<Vector>(weight + (first + j) * p.weight_pitch + i);
-        const Vector v = counted(patch + j * p.pitch + i, w), r = counted(rest + j * p.pitch + i, w), wv = w * v;
-        sums[0] += w * r * r;
-        sums[1] += wv;
-        sums[2] += wv * v;
-        sums[3] += wv * wide(rt + (first + j) * p.pitch + i);
-      }
-    double* const totals[] = {&out.square, &out.v, &out.vv, &out.vt};
-    for (int k = 0; k < 4; ++k)
-      for (int l = 0; l < LANES; ++l) *totals[k] += double(sums[k][l]) * (k == 3 ? p.r.grey : 1);
-    products(t, p, first, rows, rest, lines);
-    for (int k = 0; k < 3; ++k) {
-      for (int64_t i = 0; i < p.pitch; i += LANES) {
-        Vector sum{};
-        for (int64_t c = 0; c < p.columns; ++c) sum += float(p.inverse[k][c]) * load<Vector>(lines + c * p.pitch + i);
-        store(sum, rest + i);
-      }
-      store(Vector{}, rest + p.pitch);
-      Vector squares{};
-      for (int64_t i = 0; i < p.pitch; i += LANES) {
-        Vector sum = load<Vector>(rest + i);
-        for (int64_t l = 1; l < BLOCK; ++l) sum += load<Vector>(rest + i + l);
-        squares += sum * sum * load<Vector>(starts + i);
-      }
-      for (int l = 0; l < LANES; ++l) out.clustered[k] += squares[l];
-    }
+  const Sums& sums = scratch.sums;
+  const Coefficients &model = scratch.model, &change = scratch.change;
+  const auto gram = [&](int c, const Coefficients& u) { return std::inner_product(u.begin(), u.end(), t.gram[c], 0.0); };
+  Remains out{};
+  out.square = out.vv = sums.squares;
+  for (int c = 0; c < MOST; ++c) {  // along the column c: of r, and what the fit takes away
+    const double of_r = c == 4 ? sums.z[4] : sums.r[c] * p.grey, taken = gram(c, change), of_v = of_r + gram(c, model);
+    out.square -= change[c] * (c < 3 ? taken : 2 * of_r - taken);
+    if (c > 2) out.vv += model[c] * (of_r + of_v);
+    if (c == 3) out.vt = of_v;
+    if (c == 4) out.v = of_v;
   }
+  out.square = std::max(out.square, 0.0);
+  const int64_t columns = 5 + t.light(), pitch = t.parts_pitch;
+  const int16_t* part = t.at<int16_t>(t.parts);
+  const float* lines = scratch.lines.data();
+  float *const line = scratch.rest.data(), *const room = line + 3 * p.pitch;
+  float taken[3][MOST];
+  for (int k = 0; k < 3; ++k)
+    for (int c = 0; c < MOST; ++c) taken[k][c] = float(change[c]) * t.part[k][c];
+  Vector squares[3] = {};
+  for (int64_t first = 0; first < p.height; first += BLOCK, lines += lines_of(t) * p.pitch) {
+    blocks(t, lines, line, {room, room + pitch, room + 2 * pitch});
+    for (int k = 0; k < 3; ++k, part += columns * pitch)
+      for (int64_t b = 0; b < pitch; b += LANES) {
+        Vector rest = load<Vector>(room + k * pitch + b);
+        for (int64_t c = 0; c < columns; ++c) rest -= taken[k][c] * wide(part + c * pitch + b);
+        squares[k] += rest * rest;
+      }
+  }
+  for (int k = 0; k < 3; ++k)
+    for (int l = 0; l < LANES; ++l) out.clustered[k] += squares[k][l];
   return out;
 }
 
 // judge.flat_correlation: what is left of the correlation when both lose their planes 1, x', y'.
 inline double flat_correlation(const Template& t, const float* patch) {
   const Pixels& p = t.whole;
-  const int16_t* rt = t.at<int16_t>(p.r.at[2]);
+  const int16_t* rt = t.at<int16_t>(p.t);
   const float* weight = t.at<float>(p.weight);
   Matrix normal{}, inverse;
   double a[3] = {}, b[3] = {}, tt = 0, gg = 0, tg = 0;
   for (int64_t y = 0; y < p.height; ++y)
     for (int64_t x = 0; x < p.width; ++x) {
-      const double w = weight[y * p.weight_pitch + x], T = double(p.r.grey) * rt[y * p.pitch + x];
+      const double w = weight[y * p.weight_pitch + x], T = double(p.grey) * rt[y * p.pitch + x];
       const double g = patch[y * p.pitch + x];
       const double plane[3] = {1, (p.left + double(x)) / t.radius, (p.top + double(y)) / t.radius};
       for (int j = 0; j < 3; ++j) {
@@ -174,15 +165,13 @@ inline double finite(double value) { return std::isfinite(value) ? value : 0; }
 
 inline Verdict judge(const Template& t, const Settings& set, const State& state, Scratch& scratch) {
   const Remains left = remains(t, scratch);
-  const double about = scratch.about, dt = std::sqrt(std::max(t.wtt - t.wt * t.wt / t.w, 0.0)),
-               dg = std::sqrt(std::max(left.vv - left.v * left.v / t.w, 0.0));
+  const double w = t.gram[4][4], wt = t.gram[3][4], dt = std::sqrt(std::max(t.gram[3][3] - wt * wt / w, 0.0)),
+               dg = std::sqrt(std::max(left.vv - left.v * left.v / w, 0.0));
   Verdict v;
-  v.score = dt * dg > 1e-12 * (left.vv + 2 * about * left.v + about * about * t.w)
-                ? std::clamp((left.vt - t.wt * left.v / t.w) / (dt * dg), -1.0, 1.0)
-                : 0;
+  v.score = dt * dg > 1e-12 * left.vv ? std::clamp((left.vt - wt * left.v / w) / (dt * dg), -1.0, 1.0) : 0;
   const double alike = v.score >= set.min_score ? v.score : std::max(v.score, flat_correlation(t, scratch.patch.data()));
-  const double gain = finite(scratch.u[3]);
-  v.power = finite(left.square / std::max(t.w, 1e-30));
+  const double gain = finite(scratch.gain());
+  v.power = finite(left.square / std::max(w, 1e-30));
   constexpr double NOISE_GAIN[] = {4.0 / 9, 0.7643, 0.8427};  // sampling.NOISE_GAIN
   const double noise = v.power * double(t.count) / std::max(double(t.count) - double(t.columns), 1.0) /
                        (gain * gain + NOISE_GAIN[set.degree / 2]);

@@ -93,81 +93,119 @@ struct Packer {
     p.weight_pitch = even ? 0 : p.pitch;  // one row serves if all are alike
     const auto take = [&](int64_t bytes) { return std::exchange(end, (end + bytes + 63) / 64 * 64); };
     p.weight = take(4 * p.pitch * (even ? 1 : p.height));
-    for (int64_t& at : p.z.at) at = take(2 * p.pitch * p.height);
-    for (int64_t& at : p.r.at) at = whole ? take(2 * p.pitch * p.height) : 0;
+    for (int64_t& at : p.z) at = take(2 * p.pitch * p.height);
+    if (whole) p.t = take(2 * p.pitch * p.height);
     return p;
   }
 
-  // Values (3, n) of the chosen pixels, the first two in one unit and the third less its mean, as integers.
-  void round(const Grid& chosen, const float* const (&from)[3], Images& images, char* block) const {
+  // Values (n,) of the chosen pixels less `level` as integers; returns their unit, which `most` is the most of.
+  static float round(const Grid& chosen, const float* from, float level, float most, int16_t* to) {
+    const float unit = std::max(most, 1e-30f) / 32767;
+    for (int64_t i = 0; i < chosen.size(); ++i)
+      to[chosen.at[i]] = int16_t(std::nearbyint(std::clamp((from[i] - level) / unit, -32767.f, 32767.f)));
+    return unit;
+  }
+
+  static float most(const float* from, int64_t n, float level) {
+    float largest = 0;
+    for (int64_t i = 0; i < n; ++i) largest = std::max(largest, std::abs(from[i] - level));
+    return largest;
+  }
+
+  static float mean(const float* from, int64_t n) { return float(std::accumulate(from, from + n, 0.0) / double(n)); }
+
+  // The columns of criteria.py, R (5 + light, n), of the chosen pixels.
+  std::vector<std::vector<float>> columns(const Pixels& p, const Grid& chosen, int64_t b, const Template& t) const {
     const int64_t n = chosen.size();
-    images.level = float(std::accumulate(from[2], from[2] + n, 0.0) / double(n));
-    float most[3] = {1e-30f, 1e-30f, 1e-30f};
-    const auto level = [&](int k) { return k == 2 ? images.level : 0.f; };
-    for (int k = 0; k < 3; ++k)
-      for (int64_t i = 0; i < n; ++i) most[k] = std::max(most[k], std::abs(from[k][i] - level(k)));
-    images.gradient = std::max(most[0], most[1]) / 32767;
-    images.grey = most[2] / 32767;
-    for (int k = 0; k < 3 && images.at[k] > 0; ++k) {
-      int16_t* const to = reinterpret_cast<int16_t*>(block + images.at[k]);
-      const float unit = k == 2 ? images.grey : images.gradient;
-      for (int64_t i = 0; i < n; ++i)
-        to[chosen.at[i]] = int16_t(std::nearbyint(std::clamp((from[k][i] - level(k)) / unit, -32767.f, 32767.f)));
+    std::vector<std::vector<float>> all(5 + t.light(), std::vector<float>(n, 1));
+    for (int64_t i = 0; i < n; ++i) {
+      const float* from = of<float>(SIGNAL, b) + chosen.pixel[i];
+      const float x = float(p.left) + float(chosen.column[i]), y = float(p.top) + float(chosen.row[i]);
+      const float grey = from[3 * fields[SIGNAL].size(2)], light[] = {x, y, x * x, y * y, x * y};
+      for (int k = 0; k < 3; ++k) all[k][i] = from[k * fields[SIGNAL].size(2)];
+      all[3][i] = grey - p.level;
+      for (int k = 0; k < t.light(); ++k) all[5 + k][i] = grey * light[k];
     }
+    return all;
   }
 
   void fill(Pixels& p, const Grid& chosen, int64_t b, Template& t) const {
-    const int64_t n = chosen.size(), all_pixels = all.size();
+    const int64_t n = chosen.size(), pixels = all.size();
     char* const block = reinterpret_cast<char*>(&t);
-    std::vector<float> lines(8 * n);  // d/dx, d/dy, d/dtheta and t, raw and blurred
-    float* row[8];
-    for (int k = 0; k < 8; ++k) {
-      const float* from = of<float>(k < 4 ? SIGNAL : INSTRUMENT, b) + k % 4 * all_pixels;
-      row[k] = lines.data() + k * n;
-      for (int64_t i = 0; i < n; ++i) row[k][i] = from[chosen.pixel[i]];
-    }
     const float* weight = of<float>(WEIGHT, b);
     p.left = t.box[0][0] - t.centre[0];
     p.top = t.box[1][0] - t.centre[1];
     p.columns = t.columns;
+    p.level = mean(of<float>(SIGNAL, b) + 3 * pixels, pixels);
     float* const w = reinterpret_cast<float*>(block + p.weight);
     for (int64_t i = 0; i < n; ++i)
       w[p.weight_pitch ? chosen.at[i] : chosen.at[i] % p.pitch] = weight[chosen.pixel[i]];
-    round(chosen, {row[4], row[5], row[7]}, p.z, block);
-    round(chosen, {row[0], row[1], row[3]}, p.r, block);
-    std::vector<float> v(p.height * p.pitch), sum(MOST * p.pitch);
-    const auto project = [&](auto value) {  // Z W v
-      for (int64_t i = 0; i < n; ++i) v[chosen.at[i]] = value(i);
-      Sums sums{};
-      for (int64_t first = 0; first < p.height; first += BLOCK) {
-        products(t, p, first, std::min(BLOCK, p.height - first), v.data() + first * p.pitch, sum.data());
-        add_lines(t, p, sum.data(), sums);
+    std::vector<float> z[3];  // d/dx, d/dy and t, blurred
+    for (int k = 0; k < 3; ++k)
+      for (int64_t i : chosen.pixel) z[k].push_back(of<float>(INSTRUMENT, b)[(k < 2 ? k : 3) * pixels + i]);
+    p.soft_level = mean(z[2].data(), n);
+    const float steepest = std::max(most(z[0].data(), n, 0), most(z[1].data(), n, 0));
+    const auto images = [&](int64_t at) { return reinterpret_cast<int16_t*>(block + at); };
+    for (int k = 0; k < 2; ++k) round(chosen, z[k].data(), 0, steepest, images(p.z[k]));
+    p.soft = round(chosen, z[2].data(), p.soft_level, most(z[2].data(), n, p.soft_level), images(p.z[2]));
+    const auto R = columns(p, chosen, b, t);
+    p.grey = p.t == 0 ? 1 : round(chosen, R[3].data(), 0, most(R[3].data(), n, 0), images(p.t));
+    const int64_t line = lines_of(t) * p.pitch;
+    std::vector<float> v(p.height * p.pitch), lines(R.size() * rows_of_blocks(p) * line);
+    float* to = lines.data();
+    for (size_t k = 0; k < R.size(); ++k) {
+      for (int64_t i = 0; i < n; ++i) v[chosen.at[i]] = R[k][i];
+      Sums sums;
+      for (int64_t first = 0; first < p.height; first += BLOCK, to += line) {
+        products<false>(t, p, first, std::min(BLOCK, p.height - first), v.data() + first * p.pitch, {}, to);
+        add_lines(t, p, to, sums);
       }
-      return sums;
-    };
-    const auto contrast = [&](int64_t i) { return row[3][i] - p.r.level; };
-    p.of_one = project([](int64_t) { return 1.f; });
-    p.of_level = project(contrast);
-    double square = 0;
-    for (int64_t i = 0; i < n; ++i) square += double(weight[chosen.pixel[i]]) * contrast(i) * contrast(i);
-    p.contrast = std::sqrt(std::max(square - p.of_level[4] * p.of_level[4] / p.of_one[4], 0.0));
-    const auto light = [&](int64_t k, int64_t i) {
-      const float x = float(p.left) + float(chosen.column[i]), y = float(p.top) + float(chosen.row[i]);
-      return k == 0 ? x : k == 1 ? y : k == 2 ? x * x : k == 3 ? y * y : x * y;
-    };
-    for (int64_t k = 0; k < p.columns; ++k) {
-      const Sums sums = k == 3   ? p.of_level
-                        : k == 4 ? p.of_one
-                        : k < 3  ? project([&](int64_t i) { return row[k][i]; })
-                                 : project([&](int64_t i) { return row[3][i] * light(k - 5, i); });
-      for (int64_t j = 0; j < p.columns; ++j) p.inverse[j][k] = sums[j];
+      for (int64_t j = 0; j < p.columns; ++j) p.inverse[j][k] = sums.z[j];
+      if (k == 3) p.of_level = sums.z;
+      if (k == 4) p.of_one = sums.z;
     }
+    const auto weighed = [&](size_t i, size_t j) {
+      double sum = 0;
+      for (int64_t k = 0; k < n; ++k) sum += double(weight[chosen.pixel[k]]) * R[i][k] * R[j][k];
+      return sum;
+    };
+    p.contrast = std::sqrt(std::max(weighed(3, 3) - p.of_level[4] * p.of_level[4] / p.of_one[4], 0.0));
     invert(p.inverse, p.columns);
+    if (p.t == 0) return;
+    for (int k = 0; k < 3; ++k) std::copy_n(p.inverse[k], MOST, t.K[k]);
+    for (size_t i = 0; i < R.size(); ++i)
+      for (size_t j = 0; j <= i; ++j) t.gram[i][j] = t.gram[j][i] = weighed(i, j);
+    parts(t, lines.data(), int64_t(R.size()));
+  }
+
+  // Sums of K's first rows times R over each block, from the lines (columns, rows of blocks, lines_of, pitch) of R.
+  static void parts(Template& t, const float* lines, int64_t columns) {
+    const Pixels& p = t.whole;
+    const int64_t count = rows_of_blocks(p), each = 3 * columns * t.parts_pitch;
+    std::vector<float> sums(count * each), line(3 * p.pitch);
+    const auto row = [&](int64_t r, int64_t k, int64_t c) { return r * each + (k * columns + c) * t.parts_pitch; };
+    for (int64_t c = 0; c < columns; ++c)
+      for (int64_t r = 0; r < count; ++r, lines += lines_of(t) * p.pitch) {
+        float* const from = sums.data();
+        blocks(t, lines, line.data(), {from + row(r, 0, c), from + row(r, 1, c), from + row(r, 2, c)});
+      }
+    int16_t* const to = reinterpret_cast<int16_t*>(reinterpret_cast<char*>(&t) + t.parts);
+    for (int64_t c = 0; c < columns; ++c)
+      for (int64_t k = 0; k < 3; ++k) {
+        float largest = 0;
+        for (int64_t r = 0; r < count; ++r) largest = std::max(largest, most(sums.data() + row(r, k, c), t.parts_pitch, 0));
+        t.part[k][c] = std::max(largest, 1e-30f) / 32767;
+        for (int64_t r = 0; r < count; ++r)
+          for (int64_t i = row(r, k, c); i < row(r, k, c) + t.parts_pitch; ++i)
+            to[i] = int16_t(std::nearbyint(sums[i] / t.part[k][c]));
+      }
   }
 
   at::Tensor pack() {
     int64_t bytes = (sizeof(Template) + 63) / 64 * 64;
     const Pixels whole = shape(all, true, bytes), thin = shape(some, false, bytes);
+    const int64_t parts = bytes, parts_pitch = padded((whole.width + BLOCK - 1) / BLOCK);
+    bytes += (6 * (5 + std::max<int64_t>(criterion, 0)) * parts_pitch * rows_of_blocks(whole) + 63) / 64 * 64;
     const int64_t count = fields[K].size(0), n = fields[K].size(2);
     const at::Tensor packed = at::zeros({count, bytes}, at::kByte);
     at::parallel_for(0, count, 1, [&](int64_t first, int64_t last) {
@@ -186,19 +224,15 @@ struct Packer {
         std::copy_n(of<double>(SPREAD, b), 9, t.spread);
         std::copy_n(of<double>(INFLATION, b), 9, t.inflation);
         std::copy_n(of<double>(SPREAD_NOISE, b), 9, t.spread_noise);
+        t.parts = parts;
+        t.parts_pitch = parts_pitch;
         t.whole = whole;
         t.thin = thin;
         fill(t.whole, all, b, t);
         fill(t.thin, some, b, t);
-        const float *k = of<float>(K, b), *weight = of<float>(WEIGHT, b), *level = of<float>(SIGNAL, b) + 3 * n;
+        const float *k = of<float>(K, b), *weight = of<float>(WEIGHT, b);
         for (int64_t r = 0; r < 3; ++r) t.white[r] = std::inner_product(k + r * n, k + (r + 1) * n, k + r * n, 0.0);
-        for (int64_t i = 0; i < n; ++i) {
-          const double contrast = level[i] - t.whole.r.level;
-          t.count += weight[i] > 0;
-          t.w += weight[i];
-          t.wt += weight[i] * contrast;
-          t.wtt += weight[i] * contrast * contrast;
-        }
+        t.count = std::count_if(weight, weight + n, [](float w) { return w > 0; });
       }
     });
     return packed;

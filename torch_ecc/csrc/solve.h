@@ -18,11 +18,14 @@ struct Settings {
   double tolerance, min_score;
 };
 
-struct Scratch {  // of one thread, kept from call to call
+struct Scratch {  // of one thread, kept from call to call; all but the window is of the last patch sampled
   Window window;
-  std::vector<float> patch, lines;  // the last sampled patch, (height, pitch), less the grey level `about`
-  float about;
-  Sums u;  // what the patch is made of: coefficients of the criterion's columns
+  std::vector<float> patch, lines;  // (height, pitch); (rows of blocks, lines_of, pitch), if it is of a whole template
+  std::vector<float> rest;          // room for three lines, and three of blocks
+  Coefficients model, change;       // what its sums count from, and what its fit has more of each column
+  Sums sums;
+
+  double gain() const { return model[3] + change[3]; }
 };
 
 // pose.compose, and pose.compose(pose.inverse(a), b).
@@ -77,55 +80,60 @@ void cover(const Template& t, const Frame& frame, const Warp& warp, Window& wind
   if (anew || !covered) open_window<degree>(frame, low, high, degree == 1 ? 4 : 1, window);
 }
 
-// Samples the patch and returns Z W v. The sums that serve do not feel the level v is counted from, but stay small.
-template <int degree>
-Sums look(const Template& t, const Pixels& p, const Warp& warp, Scratch& scratch) {
+// What the patch is likely made of, after an earlier look if there was one: where little is left, sums lose little.
+inline Coefficients expected(const Template& t, const Scratch& scratch, bool whole, bool anew) {
+  Coefficients model{0, 0, 0, 0, scratch.patch[(whole ? t.whole : t.thin).width / 2]};
+  if (whole && t.criterion == SSD) model = {0, 0, 0, 1, t.whole.level};
+  if (whole && t.criterion >= 0 && !anew && scratch.gain() > 0 && scratch.gain() < INFINITE)
+    for (int k = 3; k < MOST; ++k) model[k] = scratch.model[k] + scratch.change[k];
+  return model;
+}
+
+// Samples the patch and adds up its products.
+template <int degree, bool whole>
+void look(const Template& t, const Warp& warp, bool anew, Scratch& scratch) {
+  const Pixels& p = whole ? t.whole : t.thin;
   const Window& window = scratch.window;
   const double x0 = warp.x0 - double(window.x0 + degree / 2), y0 = warp.y0 - double(window.y0 + degree / 2);
-  Sums sums{};
+  float* lines = scratch.lines.data();
+  scratch.sums = {};
   for (int64_t first = 0; first < p.height; first += BLOCK) {
     const int64_t rows = std::min(BLOCK, p.height - first);
     float* const band = scratch.patch.data() + first * p.pitch;
-    fetch(t, p, p.z, first);
     for (int64_t j = 0; j < rows; ++j) {
       const double y = p.top + double(first + j) * p.step;
       sample<degree>(window,
                      {float(warp.c * p.left + warp.s * y + x0), float(warp.c * y - warp.s * p.left + y0),
                       float(warp.c * p.step), float(-warp.s * p.step), int(p.width)},
                      band + j * p.pitch);
+      fetch(t, p, first + BLOCK + j);
     }
-    if (first == 0) scratch.about = band[p.width / 2];
-    for (int64_t i = 0; i < rows * p.pitch; ++i) band[i] -= scratch.about;
-    products(t, p, first, rows, band, scratch.lines.data());
-    add_lines(t, p, scratch.lines.data(), sums);
+    if (first == 0) scratch.model = expected(t, scratch, whole, anew);
+    products<whole>(t, p, first, rows, band, scratch.model, lines);
+    add_lines(t, p, lines, scratch.sums);
+    if (whole) lines += lines_of(t) * p.pitch;
   }
-  return sums;
 }
 
-// Coefficients of all columns (Criterion.fit) from Z W v and the patch, and of those the step (Criterion.step).
-inline Sums coefficients(const Template& t, const Pixels& p, Sums sums, Scratch& scratch, double (&step)[3]) {
+// What the fit (Criterion.fit) has more of each column than the model, and the step (Criterion.step).
+inline void fit(const Template& t, const Pixels& p, Scratch& scratch, double (&step)[3]) {
+  const Coefficients& model = scratch.model;
+  Coefficients sums = scratch.sums.z, &change = scratch.change;
   if (t.criterion >= 0) {
-    const Sums u = multiply(p, sums);
-    for (int k = 0; k < 3; ++k) step[k] = u[k] / std::max(u[3], 0.0);
-    return u;
+    change = multiply(p, sums);
+    for (int k = 0; k < 3; ++k) step[k] = change[k] / std::max(scratch.gain(), 0.0);
+    return;
   }
-  Sums fit{0, 0, 0, 1, double(p.r.level) - scratch.about};  // v = t
-  if (t.criterion == PAPER) {                               // v less its mean, over t less its mean
-    double square = 0, w = p.of_one[4], wt = p.of_level[4];
-    const float* weight = t.at<float>(p.weight);
-    for (int64_t j = 0; j < p.height; ++j) {
-      float sum = 0;
-      const float* v = scratch.patch.data() + j * p.pitch;
-      for (int64_t i = 0; i < p.width; ++i) sum += weight[j * p.weight_pitch + i] * v[i] * v[i];
-      square += sum;
-    }
-    fit[3] = std::sqrt(std::max(square - sums[4] * sums[4] / w, 0.0)) / std::max(p.contrast, 1e-30);
-    fit[4] = sums[4] / w - fit[3] * wt / w;
+  double gain = 1, one = t.whole.level;  // v = t
+  if (t.criterion == PAPER) {            // v less its mean, over t less its mean; the model is a constant
+    const double w = p.of_one[4], wt = p.of_level[4];
+    gain = std::sqrt(std::max(scratch.sums.squares - sums[4] * sums[4] / w, 0.0)) / std::max(p.contrast, 1e-30);
+    one = model[4] + sums[4] / w - gain * wt / w;
   }
-  for (int k = 0; k < 5; ++k) sums[k] -= fit[3] * p.of_level[k] + fit[4] * p.of_one[k];
-  const Sums u = multiply(p, sums);
-  for (int k = 0; k < 3; ++k) step[k] = u[k] / fit[3];
-  return fit;
+  change = {0, 0, 0, gain - model[3], one - model[4]};
+  for (int k = 0; k < 3; ++k) sums[k] -= change[3] * p.of_level[k] + change[4] * p.of_one[k];
+  const Coefficients moved = multiply(p, sums);
+  for (int k = 0; k < 3; ++k) step[k] = moved[k] / gain;
 }
 
 // solver.gauss_newton after the step is known: secant stretch, update (eq. 10), predicted error.
@@ -139,7 +147,10 @@ inline void advance(const Template& t, const double (&step)[3], State& state) {
   }
   length = std::sqrt(length);
   last = std::sqrt(last);
-  const double rate = std::clamp(last > 0 ? length / last : 0.5, 0.05, 0.95);
+  // A first step after another stage is not the next of a series: what share of its way a step covers is known.
+  const bool first = !std::isfinite(state.error);
+  const double ratio = first && state.factor > 1 ? 1 - 1 / state.factor : last > 0 ? length / last : 0.5;
+  const double rate = std::clamp(ratio, 0.05, 0.95);
   along /= last * last;
   const bool usable = last < SECANT_RANGE && along < 0.9 && std::isfinite(state.error);
   const double factor = usable ? std::clamp(state.factor / (1 - along), 1.0, LARGEST_STRETCH) : 1.0;
@@ -154,15 +165,17 @@ inline void advance(const Template& t, const double (&step)[3], State& state) {
   state.iterations += 1;
 }
 
-template <int degree>
-void iterate(const Template& t, const Pixels& p, const Frame& frame, double tolerance, int64_t budget, State& state,
-             Scratch& scratch) {
+template <int degree, bool whole>
+void iterate(const Template& t, const Frame& frame, double tolerance, int64_t budget, State& state, Scratch& scratch) {
+  const Pixels& p = whole ? t.whole : t.thin;
   state.error = INFINITE;
+  for (int64_t row = 0; row < BLOCK; ++row) fetch(t, p, row);
   for (int64_t k = 0; k < budget && state.error > tolerance; ++k) {
     const Warp warp = warp_of(state.pose);
     cover<degree>(t, frame, warp, scratch.window, k == 0);
+    look<degree, whole>(t, warp, state.iterations == 0, scratch);
     double step[3];
-    scratch.u = coefficients(t, p, look<degree>(t, p, warp, scratch), scratch, step);
+    fit(t, p, scratch, step);
     if (std::isfinite(step[0]) && std::isfinite(step[1]) && std::isfinite(step[2])) {
       advance(t, step, state);
     } else {
@@ -175,17 +188,22 @@ void iterate(const Template& t, const Pixels& p, const Frame& frame, double tole
 inline bool refine(const Template& t, const Frame& frame, const Settings& set, State& state, Scratch& scratch) {
   int64_t budget = set.max_iterations;
   scratch.patch.resize(t.whole.height * t.whole.pitch + LANES);
-  scratch.lines.resize((MOST + BLOCK + 1) * t.whole.pitch + LANES);
+  scratch.lines.resize(rows_of_blocks(t.whole) * lines_of(t) * t.whole.pitch);
+  scratch.rest.assign(3 * (t.whole.pitch + t.parts_pitch), 0);
   if (!inside(t, state.pose, frame, EDGE)) return false;
   if (budget > 1 && (set.degree > 1 || t.thin.step > 1)) {
     const int64_t coarse = std::max<int64_t>(budget * 2 / 3, 1);
-    iterate<1>(t, t.thin, frame, std::max(set.tolerance, COARSE_TOLERANCE), coarse, state, scratch);
+    const double near = std::max(set.tolerance, COARSE_TOLERANCE);
+    if (t.thin.step > 1)
+      iterate<1, false>(t, frame, near, coarse, state, scratch);
+    else
+      iterate<1, true>(t, frame, near, coarse, state, scratch);
     budget -= coarse;
     if (!inside(t, state.pose, frame, EDGE)) return false;
   }
-  if (set.degree == 1) iterate<1>(t, t.whole, frame, set.tolerance, budget, state, scratch);
-  if (set.degree == 3) iterate<3>(t, t.whole, frame, set.tolerance, budget, state, scratch);
-  if (set.degree == 5) iterate<5>(t, t.whole, frame, set.tolerance, budget, state, scratch);
+  if (set.degree == 1) iterate<1, true>(t, frame, set.tolerance, budget, state, scratch);
+  if (set.degree == 3) iterate<3, true>(t, frame, set.tolerance, budget, state, scratch);
+  if (set.degree == 5) iterate<5, true>(t, frame, set.tolerance, budget, state, scratch);
   return inside(t, state.pose, frame, 0);
 }
 

@@ -3,6 +3,9 @@
 // With Z the instruments and R the columns of criteria.py, K = (Z W R^T)^-1 Z W. All columns are made of three images
 // (d/dx, d/dy and t) and the pixels' coordinates, so that K g = inverse * (Z W g) takes 6 bytes per pixel where K takes
 // 4 per column. `inverse` is made from the rounded Z: K R = 1 holds exactly, and rounding cannot shift a pose.
+//
+// What judge.h has to know of the rest of a patch, r = g - R^T u, needs no second pass over the pixels either: sums of
+// g less a model known beforehand, and constants of the template (`gram`, `parts`), tell it.
 #pragma once
 #include <array>
 
@@ -12,28 +15,32 @@ namespace ecc {
 
 constexpr int MOST = 10, SSD = -1, PAPER = -2;  // columns; criteria in place of a number of light columns
 constexpr int64_t BLOCK = 6;                    // reference.BLOCK
-using Sums = std::array<double, MOST>;          // of Z W v: [G, t, 1, t x', t y', t x'^2, t y'^2, t x' y']
+using Coefficients = std::array<double, MOST>;  // of [G, t - level, 1, t x', t y', t x'^2, t y'^2, t x' y']
 
-struct Images {  // d/dx and d/dy in units of `gradient`, t in units of `grey` counted from `level`
-  int64_t at[3];  // where each begins, in bytes from the template
-  float gradient, grey, level;
+struct Sums {
+  Coefficients z{}, r{};  // Z W r and, of whole templates, R W r from the column t - level on
+  double squares = 0;     // r W r
 };
 
 struct Pixels {  // of a template, all of them or those of every step-th row and column, as far as they are used
   int64_t width, height, pitch, weight, weight_pitch, columns;  // weight: of a row, in bytes from the template
+  int64_t z[3], t;         // where d/dx, d/dy and t of Z and, if not 0, the raw t begin, likewise
   double left, top, step;  // relative to the centre, px
   double contrast;         // weighted norm of t less its mean
-  Images z, r;
+  float soft, soft_level, grey, level;  // unit of Z's t and of the raw t, and what they count from
   double inverse[MOST][MOST];
-  Sums of_level, of_one;  // Z W (t - level) and Z W 1
+  Coefficients of_level, of_one;  // Z W (t - level) and Z W 1
 };
 
 struct Template {  // the head of a block of bytes; images and weights lie behind it
   int64_t criterion, columns, blocks, count;
   double box[2][4], centre[2], radius, noise, noise_share;
-  double w, wt, wtt;  // sums of the weights, times t - level, times its square
-  double white[3];    // square sums of K's first rows
+  double gram[MOST][MOST];  // R W R^T, at least as far as the column 1
+  double white[3];          // square sums of K's first rows
   double alias[12], slope[9], spread[9], inflation[9], spread_noise[9];
+  int64_t parts, parts_pitch;  // where the sums of K's first rows times R over each block begin, and their row
+  float part[3][MOST];         // units of those: (rows of blocks, 3, columns, parts_pitch)
+  float K[3][MOST];            // first rows of the inverse
   Pixels whole, thin;
 
   template <class T>
@@ -43,6 +50,11 @@ struct Template {  // the head of a block of bytes; images and weights lie behin
   int light() const { return criterion < 0 ? 0 : int(criterion); }
 };
 
+// Lines of sums that `products` makes: Z's columns, r W r, and of the columns of R that hold t.
+inline int64_t lines_of(const Template& t) { return 7 + 2 * t.light(); }
+
+inline int64_t rows_of_blocks(const Pixels& p) { return (p.height + BLOCK - 1) / BLOCK; }
+
 // Coordinates of the first pixels of a row.
 inline Vector row_of(const Pixels& p) {
   Vector x;
@@ -51,99 +63,139 @@ inline Vector row_of(const Pixels& p) {
 }
 
 // v where it has weight; elsewhere it may be anything, NaN too: whole vectors reach beyond what has been sampled.
-inline Vector counted(const float* v, const Vector& weight) { return weight > 0 ? load<Vector>(v) : Vector{}; }
+inline Vector counted(const Vector& v, const Vector& weight) { return weight > 0 ? v : Vector{}; }
 
 // By way of whole vectors of 32 bits, which compilers would otherwise take apart.
 inline Vector wide(const int16_t* from) {
   return __builtin_convertvector(__builtin_convertvector(load<Shorts>(from), Ints), Vector);
 }
 
-// Asks for a row of blocks from memory ahead of its use: too many rows at once for the processor to guess them.
-inline void fetch(const Template& t, const Pixels& p, const Images& images, int64_t first) {
-  const int64_t begin = 2 * first * p.pitch, end = 2 * std::min(first + BLOCK, p.height) * p.pitch;
-  for (int64_t offset : images.at)
-    for (int64_t at = begin; at < end; at += 64) __builtin_prefetch(t.at<char>(offset + at));
+// Asks for a row of images from memory well ahead of its use: they are too many for the processor to guess.
+inline void fetch(const Template& t, const Pixels& p, int64_t row) {
+  if (row >= p.height) return;
+  const int64_t begin = 2 * row * p.pitch, end = begin + 2 * p.pitch;
+  for (int64_t offset : {p.z[0], p.z[1], p.z[2], p.t})
+    for (int64_t at = begin; offset > 0 && at < end; at += 64) __builtin_prefetch(t.at<char>(offset + at));
 }
 
-// lines (5 + light, pitch) = sums over `rows` rows from `first` on of each column of Z times w v. v: (rows, pitch)
-// x is the same down a column of pixels: it is left to the end. even: one row of weights serves for all.
-template <int light, bool even>
-void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, float* lines) {
-  const int16_t *zx = t.at<int16_t>(p.z.at[0]), *zy = t.at<int16_t>(p.z.at[1]), *zt = t.at<int16_t>(p.z.at[2]);
+// lines (lines_of, pitch) = sums over `rows` rows from `first` on of each column of Z times w r, of r w r and, if
+// whole, of R's columns that hold t, in units of Z and R; r = v less a model by R from t on, or by the column 1 alone.
+// x is the same down a column of pixels: it is left to the end. even: one row of weights serves for all. v: (rows, pitch)
+template <int light, bool even, bool whole>
+void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, const Coefficients& model,
+              float* lines) {
+  const int16_t *zx = t.at<int16_t>(p.z[0]), *zy = t.at<int16_t>(p.z[1]), *zt = t.at<int16_t>(p.z[2]);
+  const int16_t* grey_of_r = t.at<int16_t>(p.t);
   const float* weight = t.at<float>(p.weight) + first * p.weight_pitch;
-  const float level = p.z.level / p.z.grey, step = float(p.step), top = float(p.top + double(first) * p.step);
+  const float soft_level = p.soft_level / p.soft, level = p.level / p.grey, step = float(p.step), top = float(p.top + double(first) * p.step);
+  float by[MOST];
+  for (int k = 3; k < MOST; ++k) by[k] = float(model[k]) * (k == 4 ? 1 : p.grey);
   Vector x = row_of(p);
   for (int64_t i = 0; i < p.pitch; i += LANES, x += LANES * step) {
-    Vector gx{}, gxy{}, gy{}, grey{}, greyy{}, greyyy{}, all{}, ally{}, allyy{}, w = load<Vector>(weight + i);
+    Vector gx{}, gxy{}, gy{}, grey{}, greyy{}, greyyy{}, all{}, ally{}, allyy{};
+    Vector squares{}, raw{}, rawy{}, rawyy{};
+    Vector w = load<Vector>(weight + i);
+    const Vector slope = x * (by[5] + x * by[7]), bend = by[6] + x * by[9];
     for (int64_t j = 0; j < rows; ++j) {
       const int64_t at = (first + j) * p.pitch + i;
       const float y = top + float(j) * step;
       if constexpr (!even) w = load<Vector>(weight + j * p.weight_pitch + i);
-      const Vector wv = w * counted(v + j * p.pitch + i, w), dx = wide(zx + at) * wv, bright = wide(zt + at) * wv;
+      Vector r = load<Vector>(v + j * p.pitch + i) - by[4], shade;
+      if constexpr (whole) {
+        shade = wide(grey_of_r + at);
+        r -= by[3] * shade;
+        if constexpr (light > 0) r -= (slope + y * (light > 2 ? bend + y * by[8] : bend)) * (shade + level);
+      }
+      r = counted(r, w);
+      const Vector wr = w * r, dx = wide(zx + at) * wr, bright = wide(zt + at) * wr;
+      if constexpr (whole) {
+        shade *= wr;
+        raw += shade;
+        if constexpr (light > 0) rawy += shade * y;
+        if constexpr (light > 2) rawyy += shade * (y * y);
+      }
+      squares += wr * r;
       gx += dx;
       gxy += dx * y;
-      gy += wide(zy + at) * wv;
+      gy += wide(zy + at) * wr;
       grey += bright;
-      all += wv;
+      all += wr;
       if constexpr (light > 0) {
         greyy += bright * y;
-        ally += wv * y;
+        ally += wr * y;
       }
       if constexpr (light > 2) {
         greyyy += bright * (y * y);
-        allyy += wv * (y * y);
+        allyy += wr * (y * y);
       }
     }
-    const Vector ty = greyy + level * ally, tx = (grey + level * all) * x;
-    const Vector sum[] = {gx, gy, gxy - gy * x, grey, all, tx, ty, tx * x, greyyy + level * allyy, ty * x};
-    for (int k = 0; k < 5 + light; ++k) store(sum[k], lines + k * p.pitch + i);
+    const auto lit = [&](const Vector& t, const Vector& ty, const Vector& tyy, float level, float* to) {  // t x', t y' ...
+      const Vector by_y = ty + level * ally, by_x = (t + level * all) * x;
+      const Vector sum[] = {by_x, by_y, by_x * x, tyy + level * allyy, by_y * x};
+      for (int k = 0; k < light; ++k) store(sum[k], to + k * p.pitch + i);
+    };
+    const Vector sum[] = {gx, gy, gxy - gy * x, grey, all};
+    for (int k = 0; k < 5; ++k) store(sum[k], lines + k * p.pitch + i);
+    lit(grey, greyy, greyyy, soft_level, lines + 5 * p.pitch);
+    store(squares, lines + (5 + light) * p.pitch + i);
+    store(raw, lines + (6 + light) * p.pitch + i);
+    lit(raw, rawy, rawyy, level, lines + (7 + light) * p.pitch);
   }
 }
 
-template <bool even>
-void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, float* lines) {
-  if (t.light() == 0) products<0, even>(t, p, first, rows, v, lines);
-  if (t.light() == 2) products<2, even>(t, p, first, rows, v, lines);
-  if (t.light() == 5) products<5, even>(t, p, first, rows, v, lines);
+template <bool even, bool whole>
+void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, const Coefficients& model,
+              float* lines) {
+  if (t.light() == 0) products<0, even, whole>(t, p, first, rows, v, model, lines);
+  if (t.light() == 2) products<2, even, whole>(t, p, first, rows, v, model, lines);
+  if (t.light() == 5) products<5, even, whole>(t, p, first, rows, v, model, lines);
 }
 
-inline void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, float* lines) {
-  p.weight_pitch ? products<false>(t, p, first, rows, v, lines) : products<true>(t, p, first, rows, v, lines);
+template <bool whole>
+void products(const Template& t, const Pixels& p, int64_t first, int64_t rows, const float* v, const Coefficients& model,
+              float* lines) {
+  if (p.weight_pitch)
+    products<false, whole>(t, p, first, rows, v, model, lines);
+  else
+    products<true, whole>(t, p, first, rows, v, model, lines);
 }
 
 inline void add_lines(const Template& t, const Pixels& p, const float* lines, Sums& sums) {
-  for (int k = 0; k < 5 + t.light(); ++k) {
+  const int64_t columns = 5 + t.light();
+  const auto add = [&](double& total) {
     float sum = 0;
-    for (int64_t i = 0; i < p.pitch; ++i) sum += lines[k * p.pitch + i];
-    sums[k] += sum;
-  }
+    for (int64_t i = 0; i < p.pitch; ++i) sum += lines[i];
+    total += sum;
+    lines += p.pitch;
+  };
+  for (int64_t k = 0; k < columns; ++k) add(sums.z[k]);
+  add(sums.squares);
+  for (int64_t k = 3; k < columns; ++k)
+    if (k != 4) add(sums.r[k]);
 }
 
-inline Sums multiply(const Pixels& p, const Sums& sums) {
-  Sums u{};
+inline Coefficients multiply(const Pixels& p, const Coefficients& sums) {
+  Coefficients u{};
   for (int64_t i = 0; i < p.columns; ++i)
     for (int64_t j = 0; j < p.columns; ++j) u[i] += p.inverse[i][j] * sums[j];
   return u;
 }
 
-// r = g less its model R^T u in `rows` rows from `first` on, with t less its level in column 3.
-inline void residual(const Template& t, int64_t first, int64_t rows, const Sums& u, const float* v, float* r) {
+// to[k] (blocks of a row) = sums over each block of lines (lines_of, pitch) under the rows k of K. line: (3, pitch).
+inline void blocks(const Template& t, const float* lines, float* line, float* const (&to)[3]) {
   const Pixels& p = t.whole;
-  const int16_t *rx = t.at<int16_t>(p.r.at[0]), *ry = t.at<int16_t>(p.r.at[1]), *rt = t.at<int16_t>(p.r.at[2]);
-  const float unit = p.r.gradient, grey = p.r.grey, level = p.r.level, one = float(u[4]), turn = float(u[2]) * unit;
-  for (int64_t j = 0; j < rows; ++j) {
-    const double y = p.top + double(first + j);
-    const float in_x = float(u[0] + u[2] * y) * unit, in_y = float(u[1]) * unit, gain = float(u[3]);
-    const float even = float(u[6] * y + u[8] * y * y), slope = float(u[5] + u[9] * y), bend = float(u[7]);
-    Vector x = row_of(p);
-    for (int64_t i = 0; i < p.pitch; i += LANES, x += float(LANES)) {
-      const int64_t at = (first + j) * p.pitch + i;
-      const Vector contrast = wide(rt + at) * grey, light = even + x * (slope + x * bend);
-      const Vector motion = in_x * wide(rx + at) + (in_y - turn * x) * wide(ry + at);
-      store(load<Vector>(v + j * p.pitch + i) - one - motion - gain * contrast - light * (contrast + level),
-            r + j * p.pitch + i);
-    }
+  for (int64_t i = 0; i < p.pitch; i += LANES) {
+    Vector sum[3] = {};
+    for (int64_t c = 0; c < p.columns; ++c)
+      for (int k = 0; k < 3; ++k) sum[k] += t.K[k][c] * load<Vector>(lines + c * p.pitch + i);
+    for (int k = 0; k < 3; ++k) store(sum[k], line + k * p.pitch + i);
   }
+  for (int k = 0; k < 3; ++k, line += p.pitch)
+    for (int64_t b = 0, i = 0; i < p.width; ++b) {
+      float sum = 0;
+      for (const int64_t end = std::min(i + BLOCK, p.width); i < end; ++i) sum += line[i];
+      to[k][b] = sum;
+    }
 }
 
 }  // namespace ecc
