@@ -1,7 +1,8 @@
 """Accuracy on analytic scenes: python benchmarks/accuracy.py [DRAWS] [--poses N] [--only SECTION]... [--out FILE.json]
 
 Sections: scatter over the Cramer-Rao bound and normalised error squared (template and frame redrawn); the largest error
-in N random poses; sequences of eq. (11) and two full turns; uneven light.
+in N random poses, unrounded and rounded, beside what rounding leaves to one who knows the scene; sequences of eq. (11)
+and two full turns; uneven light.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ import torch
 from results import Figure, save
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
-from torch_ecc.experiments.accuracy import Draws, Harmonic, Scatter, scatter, track_path, under_light
+from torch_ecc.experiments.accuracy import Draws, Harmonic, Scatter, by_sampler, least, scatter, track_path, under_light
 from torch_ecc.sim.camera import Camera
 from torch_ecc.sim.light import GradientLight, SpotLight
 from torch_ecc.sim.pads import Pads
@@ -24,6 +26,7 @@ from torch_ecc.sim.sequence import Sequence
 from torch_ecc.sim.waves import PlaneWaves
 
 SCENES = {"waves": PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0), "pads": Pads.wafer()}
+SAMPLERS = ("bilinear", "bspline3", "bspline5")
 MOTIONS = {False: "shifts only", True: "any angle"}
 console = Console(width=120)
 
@@ -77,23 +80,51 @@ def scatters(draws: int) -> list[Figure]:
 
 
 def poses(count: int) -> list[Figure]:
-    """Largest errors without noise, start 0.3 px and 0.17 deg off, by sampler."""
+    """Errors without noise, start 0.3 px and 0.17 deg off, by sampler; unrounded, and in 8 bit beside those of an
+    oracle: the scene itself fitted to the same frames by least squares."""
     rows, figures = [], []
     for name, scene in SCENES.items():
-        for turn in (False, True):
-            for interpolation in ("bilinear", "bspline3", "bspline5"):
-                px, deg, bad = _worst(scatter(scene, Draws(0.0, count, turn, interpolation=interpolation, seed=1)))
-                rows.append((name, MOTIONS[turn], interpolation, f"{px:.5f}", f"{deg:.5f}", str(bad)))
-                title = f"{name}, {MOTIONS[turn]}, {interpolation} / largest error"
-                figures += [Figure(title, px, "px", "lower", 0.1), Figure(f"{title}, theta", deg, "deg", "lower", 0.1)]
-    header = ("scene", "motion", "sampler", "largest px", "largest deg", "not converged")
-    show(f"{count} random poses, rounded to 8 bit, no noise", header, rows)
+        for turn, motion in MOTIONS.items():
+            for bits in (None, 8):
+                draws = Draws(0.0, count, turn, bits=bits, seed=1)
+                found = by_sampler(scene, draws, SAMPLERS)
+                rows += [(name, motion, *row) for row in _by_error(found, least(scene, draws) if bits else None)]
+                for sampler, s in found.items():
+                    title = f"{name}, {motion}, {sampler}{'' if bits else ', unrounded'} / largest error"
+                    px, deg = _pair(s.error.abs().amax(0))
+                    figures.append(Figure(title, px, "px", "lower", 0.1))
+                    figures.append(Figure(f"{title}, theta", deg, "deg", "lower", 0.1))
+    header = ("scene", "motion", "bits", "sampler", "bad", "largest px", "deg", "rms px", "deg", "off oracle px", "deg")
+    show(f"{count} random poses, no noise; bad: not converged; off oracle: largest difference", header, rows)
     return figures
 
 
-def _worst(s: Scatter) -> tuple[float, float, int]:
-    x, y, theta = s.error.abs().amax(0).tolist()
-    return max(x, y), math.degrees(theta), int((s.status != 0).sum())
+def _by_error(found: dict[str, Scatter], best: Tensor | None) -> list[tuple[str, ...]]:
+    """Rows by sampler; where the oracle's errors (draws, 3) are given, these and the Cramer-Rao bound too."""
+    rows = []
+    for sampler, s in found.items():
+        off = () if best is None else _numbers((s.error - best).abs().amax(0))
+        bad = str(int((s.status != 0).sum()))
+        rows.append(("none" if best is None else "8", sampler, bad, *_errors(s.error), *off))
+    if best is not None:
+        rows.append(("8", "oracle", "", *_errors(best)))
+        rows.append(("8", "bound", "", "", "", *_numbers(found[SAMPLERS[0]].bound)))
+    return rows
+
+
+def _errors(error: Tensor) -> tuple[str, ...]:
+    """Largest and root mean square of (draws, 3)."""
+    return (*_numbers(error.abs().amax(0)), *_numbers(error.square().mean(0).sqrt()))
+
+
+def _numbers(error: Tensor) -> tuple[str, ...]:
+    return tuple(f"{v:.5f}" for v in _pair(error))
+
+
+def _pair(error: Tensor) -> tuple[float, float]:
+    """The worse of x and y, px, and theta, deg, of (3,)."""
+    x, y, theta = error.tolist()
+    return max(x, y), math.degrees(theta)
 
 
 def sequences() -> list[Figure]:

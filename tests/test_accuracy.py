@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from torch_ecc import Status, align, prepare
-from torch_ecc.experiments.accuracy import Draws, Harmonic, scatter, track_path, under_light
+from torch_ecc.experiments.accuracy import Draws, Harmonic, least, scatter, track_path, under_light
+from torch_ecc.experiments.bound import cramer_rao, oracle, rounding
 from torch_ecc.judge import interpolation_error
+from torch_ecc.pose import inverse, transform
 from torch_ecc.reference import ALIASING
 from torch_ecc.sim import Sequence
 from torch_ecc.sim.camera import Camera
@@ -19,6 +21,7 @@ from torch_ecc.sim.waves import PlaneWaves
 
 MASK = torch.nn.functional.pad(torch.ones(121, 121), (8, 8, 8, 8)).bool()
 SCENE = PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0)
+SCENES = {"waves": SCENE, "pads": Pads.wafer()}
 
 
 @pytest.mark.parametrize("turn", [False, True])
@@ -45,6 +48,49 @@ def test_flat_areas_do_not_add_scatter(noise):
     chance = 1 + 2.5 / math.sqrt(2 * count)
     assert (found.ratio <= 1.1 * chance).all(), found.ratio
     assert 0.8 / chance**2 < float(found.nees.mean()) < 1.25 * chance**2
+
+
+@pytest.mark.parametrize("turn", [False, True])
+@pytest.mark.parametrize("scene", SCENES)
+def test_unrounded_the_tracker_is_exact(scene, turn):
+    error = scatter(SCENES[scene], Draws(0.0, 100, turn, bits=None)).error.abs().amax(0)
+    assert error[:2].max() < 0.001
+    assert error[2] < math.radians(0.001)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, math.pi / 2, -2.5])
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_oracle_finds_the_exact_pose_in_an_unrounded_frame(scene, angle):
+    pose = torch.tensor([100.3, 98.8, angle], dtype=torch.float64)
+    grid = torch.cartesian_prod(torch.arange(200), torch.arange(205)).flip(-1).double()
+    frame = SCENES[scene].value(transform(inverse(pose), grid)).reshape(200, 205)
+    start = pose + torch.tensor([0.3, -0.3, math.radians(0.17)])
+    found = oracle(SCENES[scene], frame, start, (121, 111)) - pose
+    assert found[:2].abs().max() < 1e-6
+    assert found[2].abs() < 1e-7
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_the_oracle_reaches_the_bound_where_rounding_errors_are_independent(bits):
+    count = 60
+    poses = torch.rand(count, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    poses = torch.tensor([90.0, 90.0, 0.0]) + poses * torch.tensor([1.0, 1.0, math.tau])
+    frames = Camera(size=(181, 181), bits=bits).capture(SCENE, poses)[:, 0]
+    found = torch.stack([oracle(SCENE, f, p, (121, 121)) for f, p in zip(frames, poses, strict=True)])
+    ratio = (found - poses).square().mean(0).sqrt() / cramer_rao(SCENE, (121, 121), rounding(bits))
+    chance = 1 + 2.5 / math.sqrt(2 * count)
+    assert ((ratio > 1 / chance) & (ratio < chance)).all(), ratio
+
+
+@pytest.mark.parametrize("turn", [False, True])
+def test_on_pads_the_error_is_what_rounding_leaves_to_anyone(turn):
+    """Edges along the pixel rows are rounded alike: several bounds, but no more than one who knows the scene has."""
+    draws = Draws(0.0, 60, turn)
+    found, best = scatter(SCENES["pads"], draws), least(SCENES["pads"], draws)
+    ours, theirs, apart = (e.square().mean(0).sqrt() for e in (found.error, best, found.error - best))
+    assert (theirs > 2 * found.bound).all(), theirs / found.bound
+    assert (ours < 1.2 * theirs).all(), ours / theirs
+    assert (apart < 0.5 * theirs).all(), apart / theirs  # the same error in each pair
 
 
 @pytest.mark.parametrize("interpolation", ALIASING)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_ecc.align import align
 from torch_ecc.estimate import Estimate, Status
-from torch_ecc.experiments.bound import QUANTISATION, cramer_rao
+from torch_ecc.experiments.bound import cramer_rao, oracle, rounding
 from torch_ecc.pose import compose, inverse
 from torch_ecc.reference import MARGIN, prepare
 from torch_ecc.sim.camera import Camera
@@ -24,13 +24,17 @@ from torch_ecc.tracker import Tracker
 
 SIZE = 121  # px, the paper's template
 BATCH = 50  # pairs that are aligned at once
+ROOM = 40  # px that a frame is larger than the template and its surroundings, on each side
+FRAME = SIZE + 2 * MARGIN + 2 * ROOM
+MIDDLE = torch.tensor([FRAME // 2, FRAME // 2, 0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
 class Draws:
     """Random pairs of template and frame, both drawn anew each time.
 
-    ``noise`` in grey levels, ``count`` pairs, displacements up to 10 px in x and y and, with ``turn``, any angle.
+    ``noise`` in grey levels, ``count`` pairs, displacements up to 10 px in x and y and, with ``turn``, any angle;
+    ``bits`` of the camera, None for no rounding.
     """
 
     noise: float = 0.0
@@ -38,7 +42,38 @@ class Draws:
     turn: bool = True
     illumination: str = "linear"
     interpolation: str = "bspline3"
+    bits: int | None = 8
     seed: int = 0
+
+
+class Pairs(NamedTuple):
+    """Poses (n, 3) of the scene in the ``first`` and the ``second`` frame of each pair, the frames (n, 1, H, W), and
+    the ``truth`` (n, 3): where the template, the middle of the first frame, is in the second."""
+
+    first: Tensor
+    second: Tensor
+    template: Tensor
+    image: Tensor
+    truth: Tensor
+
+
+def pairs(scene: Scene, draws: Draws) -> Iterator[Pairs]:
+    """The pairs of ``draws``, some at a time: templates at random sub-pixel places, frames at random poses."""
+    generator = torch.Generator().manual_seed(draws.seed)
+    phase, shift = torch.rand(2, draws.count, 3, generator=generator, dtype=torch.float64) - 0.5
+    first = MIDDLE + phase * torch.tensor([1.0, 1.0, 0.0])
+    second = first + shift * torch.tensor([20.0, 20.0, math.tau if draws.turn else 0.0])
+    camera = Camera(size=(FRAME, FRAME), noise_sigma=draws.noise, bits=draws.bits)
+    for k in range(0, draws.count, BATCH):
+        a, b = first[k : k + BATCH], second[k : k + BATCH]
+        template = camera.capture(scene, a, seed=2 * draws.seed, first=k)
+        image = camera.capture(scene, b, seed=2 * draws.seed + 1, first=k)
+        yield Pairs(a, b, template, image, moved(a, b))
+
+
+def moved(first: Tensor, second: Tensor) -> Tensor:
+    """Where the middle of a frame with the scene at ``first`` (n, 3) is in one with the scene at ``second``: (n, 3)."""
+    return compose(second, compose(inverse(first), MIDDLE.expand_as(first)))
 
 
 class Scatter(NamedTuple):
@@ -58,34 +93,45 @@ class Scatter(NamedTuple):
 
 
 def scatter(scene: Scene, draws: Draws) -> Scatter:
-    """Align templates cut at random sub-pixel places of ``scene`` with frames at random poses, 8 bit."""
-    half = SIZE // 2 + MARGIN
-    frame, middle = 2 * half + 80, torch.tensor([[half + 40.0, half + 40.0, 0.0]], dtype=torch.float64)
-    generator = torch.Generator().manual_seed(draws.seed)
-    phase, shift = torch.rand(2, draws.count, 3, generator=generator, dtype=torch.float64) - 0.5
-    first = middle + phase * torch.tensor([1.0, 1.0, 0.0])
-    second = first + shift * torch.tensor([20.0, 20.0, math.tau if draws.turn else 0.0])
-    truth = compose(second, compose(inverse(first), middle.expand_as(first)))
-    camera = Camera(size=(frame, frame), noise_sigma=draws.noise)
-    cut = slice(40, 40 + 2 * half + 1)
-    mask = torch.zeros(2 * half + 1, 2 * half + 1, dtype=torch.bool)
+    """Align all pairs of ``draws``."""
+    return by_sampler(scene, draws, (draws.interpolation,))[draws.interpolation]
+
+
+def by_sampler(scene: Scene, draws: Draws, samplers: tuple[str, ...]) -> dict[str, Scatter]:
+    """``scatter`` of the same pairs with each of the ``samplers``."""
+    cut = slice(ROOM, -ROOM)
+    mask = torch.zeros(FRAME - 2 * ROOM, FRAME - 2 * ROOM, dtype=torch.bool)
     mask[MARGIN:-MARGIN, MARGIN:-MARGIN] = True  # what lies around the template gives its border true gradients
-    near = truth + torch.tensor([0.3, -0.3, math.radians(0.17)])
-    found = []
-    for k in range(0, draws.count, BATCH):
-        part = slice(k, k + BATCH)
-        template = camera.capture(scene, first[part], seed=2 * draws.seed, first=k)[:, :, cut, cut]
-        image = camera.capture(scene, second[part], seed=2 * draws.seed + 1, first=k)
-        reference = prepare(template, illumination=draws.illumination, mask=mask)
-        found.append(align(reference, image, near[part], interpolation=draws.interpolation))
-    return _summary(scene, draws, truth, Estimate(*(torch.cat(v) for v in zip(*found, strict=True))))
+    found: dict[str, list[Estimate]] = {name: [] for name in samplers}
+    truth = []
+    for pair in pairs(scene, draws):
+        near = pair.truth + torch.tensor([0.3, -0.3, math.radians(0.17)])
+        reference = prepare(pair.template[:, :, cut, cut], illumination=draws.illumination, mask=mask)
+        for name, estimates in found.items():
+            estimates.append(align(reference, pair.image, near, interpolation=name))
+        truth.append(pair.truth)
+    bound = cramer_rao(scene, (SIZE, SIZE), 2 * (draws.noise**2 + rounding(draws.bits)))
+    return {name: _summary(estimates, torch.cat(truth), bound) for name, estimates in found.items()}
 
 
-def _summary(scene: Scene, draws: Draws, truth: Tensor, found: Estimate) -> Scatter:
+def _summary(estimates: list[Estimate], truth: Tensor, bound: Tensor) -> Scatter:
+    found = Estimate(*(torch.cat(v) for v in zip(*estimates, strict=True)))
     error = found.pose - truth
     nees = (error[:, None] @ torch.linalg.solve(found.covariance, error[:, :, None])).flatten() / 3
-    bound = cramer_rao(scene, (SIZE, SIZE), 2 * (draws.noise**2 + QUANTISATION))
     return Scatter(error, nees, bound, found.iterations, found.status)
+
+
+def least(scene: Scene, draws: Draws) -> Tensor:
+    """Pose errors (draws, 3) px, px, rad on the pairs of ``draws`` of one who knows the scene: all that rounding and
+    noise leave to least squares. The scene is fitted to either frame, and one pose taken relative to the other."""
+    errors = []
+    for pair in pairs(scene, draws):
+        first, second = (
+            torch.stack([oracle(scene, f[0], p, (SIZE, SIZE)) for f, p in zip(frames, poses, strict=True)])
+            for frames, poses in ((pair.template, pair.first), (pair.image, pair.second))
+        )
+        errors.append(moved(first, second) - pair.truth)
+    return torch.cat(errors)
 
 
 @dataclass(frozen=True)
