@@ -13,7 +13,9 @@ struct Line {  // n points x + k dx, y + k dy; (0, 0) is where the first tap of 
   int n;
 };
 
-// Weights of the degree + 1 B-spline taps around a point with the fractional part t; of one point, or of a vector.
+constexpr float UNIT[] = {0, 1, 0, 6, 0, 120};  // of the weights of each degree
+
+// UNIT times the weights of the degree + 1 B-spline taps around a point with the fractional part t; of one, or of a vector.
 template <int degree, class Real>
 void weigh(Real t, Real (&w)[degree + 1]) {
   const Real r = 1 - t;
@@ -21,20 +23,20 @@ void weigh(Real t, Real (&w)[degree + 1]) {
     w[0] = r;
     w[1] = t;
   } else if constexpr (degree == 3) {
-    const Real t2 = t * t, r2 = r * r;
-    w[0] = r2 * r * (1.f / 6);
-    w[3] = t2 * t * (1.f / 6);
-    w[1] = t2 * (0.5f * t - 1.f) + 2.f / 3;
-    w[2] = r2 * (0.5f * r - 1.f) + 2.f / 3;
+    const Real t2 = t * t;
+    w[0] = r * r * r;
+    w[3] = t2 * t;
+    w[1] = t2 * (3.f * t - 6.f) + 4.f;
+    w[2] = 6.f - w[1] - (w[0] + w[3]);
   } else {
     const Real t2 = t * t, r2 = r * r;
-    w[0] = r2 * r2 * r * (1.f / 120);
-    w[5] = t2 * t2 * t * (1.f / 120);
+    w[0] = r2 * r2 * r;
+    w[5] = t2 * t2 * t;
     // The quintic at 1 + t, 2 - t and at t, 1 - t, in powers of the distance to the nearer knot.
-    w[1] = (1.f + r * (5.f + r * (10.f + r * (10.f + r * (5.f - 5.f * r))))) * (1.f / 120);
-    w[4] = (1.f + t * (5.f + t * (10.f + t * (10.f + t * (5.f - 5.f * t))))) * (1.f / 120);
-    w[2] = 11.f / 20 + t2 * (t2 * (0.25f - t * (1.f / 12)) - 0.5f);
-    w[3] = 11.f / 20 + r2 * (r2 * (0.25f - r * (1.f / 12)) - 0.5f);
+    w[1] = 1.f + r * (5.f + r * (10.f + r * (10.f + r * (5.f - 5.f * r))));
+    w[4] = 1.f + t * (5.f + t * (10.f + t * (10.f + t * (5.f - 5.f * t))));
+    w[2] = 66.f + t2 * (t2 * (30.f - t * 10.f) - 60.f);
+    w[3] = 66.f + r2 * (r2 * (30.f - r * 10.f) - 60.f);
   }
 }
 
@@ -44,6 +46,7 @@ void weigh(Real t, Real (&w)[degree + 1]) {
 template <int degree>
 void sample_runs(const Window& window, const Line& line, float* out) {
   constexpr int taps = degree + 1;
+  constexpr float unit = 1 / (UNIT[degree] * UNIT[degree]);
   const int64_t pitch = window.pitch(), right = window.w - taps, bottom = window.h - taps;
   const float drift = line.dx - 1, across = std::abs(line.dy);
   const float per_column = -1 / std::min(drift, -1e-9f), per_row = 1 / std::max(across, 1e-9f);
@@ -67,7 +70,7 @@ void sample_runs(const Window& window, const Line& line, float* out) {
         for (int l = 1; l < taps; ++l) row += wx[l] * load<Vector>(from + k * pitch + l);
         sum += wy[k] * row;
       }
-      store(sum, out + i);
+      store(sum * unit, out + i);
     }
   }
 }
@@ -77,7 +80,7 @@ template <int degree>
 void sample_points(const Window& window, const Line& line, float* __restrict out) {
   constexpr int taps = degree + 1, CHUNK = 64, size = degree == 3 ? 4 : 8;  // of a vector that holds a row's taps
   typedef float Taps __attribute__((vector_size(4 * size)));
-  constexpr float BELOW_ONE = 0.99999f;
+  constexpr float BELOW_ONE = 0.99999f, unit = 1 / (UNIT[degree] * UNIT[degree]);
   const float right = float(window.w - taps) + BELOW_ONE, bottom = float(window.h - taps) + BELOW_ONE;
   const int32_t pitch = int32_t(window.pitch());
   const float* const from = window.values.data();
@@ -125,7 +128,7 @@ void sample_points(const Window& window, const Line& line, float* __restrict out
     for (int i = 0; i < n; ++i) {
       float sum = 0;
       for (int k = 0; k < taps; ++k) sum += wx[k][i] * row[i * size + k];
-      out[i] = sum;
+      out[i] = sum * unit;
     }
   }
 }
