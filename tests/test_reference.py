@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torch_ecc import ECC, SSD, PaperECC, prepare
+from torch_ecc.criteria import safe_inverse
 from torch_ecc.pose import transform
 from torch_ecc.reference import Reference, reweigh
 from torch_ecc.sim.scene import PlaneWaves
@@ -211,3 +212,17 @@ def test_select_keeps_the_order_asked_for():
     reference = prepare(torch.rand(3, 1, 9, 9))
     for order in ([2, 0, 1], [1, 1, 1], [0, 1, 2], [2]):
         assert torch.equal(reference.select(torch.tensor(order)).K, reference.K[order])
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(1, 5), st.integers(0, 999), st.booleans())
+def test_safe_inverse_inverts_what_is_regular_and_says_what_is_not(n, seed, in_numpy):
+    generator = torch.Generator().manual_seed(seed)
+    root = torch.randn(2, n, n + 3, generator=generator, dtype=torch.float64)
+    matrix = root @ root.mT * torch.logspace(-3, 3, n, dtype=torch.float64)
+    matrix[1, -1] = matrix[1, 0] * (n > 1)  # singular
+    inverse, regular = safe_inverse(matrix.numpy() if in_numpy else matrix)
+    assert list(map(bool, regular)) == [True, False]
+    product = torch.as_tensor(inverse)[0] @ matrix[0]
+    assert torch.allclose(product, torch.eye(n, dtype=torch.float64), atol=1e-6)
+    assert (torch.as_tensor(inverse)[1] == 0).all()

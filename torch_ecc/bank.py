@@ -17,7 +17,7 @@ from torch_ecc.noise import INSTRUMENT_BLUR
 from torch_ecc.pose import compose, rotation
 from torch_ecc.pyramid import as_images
 from torch_ecc.reference import Reference
-from torch_ecc.sampling import Bilinear, BSpline, inside
+from torch_ecc.sampling import Sampler, inside
 
 SMALLEST_SEARCHED = 24  # px: root of the area that a template keeps at the level at which it is searched for
 LEAST_DENSITY = 0.25  # of a level's pixels: texture per bandwidth, over that of white texture of the same contrast
@@ -220,9 +220,9 @@ def _turned(template: Tensor, weight: Tensor, middle: Tensor, turns: Tensor, rea
     warp = torch.cat((rotation(-turns), middle[:, None].expand(len(turns), 2, 1)), -1)
     size = (template.shape[-2], template.shape[-1])
     framed = inside(warp, pixels, size)
-    spline = BSpline.of(weighted, 3)
+    spline = Sampler.of(weighted, 3)
     shape = (len(turns), n, n)
-    return (spline(warp, pixels) * framed).view(shape), (Bilinear(weight)(warp, pixels) * framed).view(shape)
+    return (spline(warp, pixels) * framed).view(shape), (Sampler(weight)(warp, pixels) * framed).view(shape)
 
 
 def _disc_image(reach: int, radius: float) -> Tensor:

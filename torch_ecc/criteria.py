@@ -77,17 +77,21 @@ class ECC:
 
     def step(self, reference: Reference, g: Tensor) -> Tensor:
         """b / a, (B, 3); infinite or NaN where the gain a is not positive."""
-        g = g - g[:, :1]  # K does not see a constant, but its sums stay small
-        u = torch.bmm(reference.K[:, :4], g[:, :, None])[:, :, 0]
-        return u[:, :3] / u[:, 3:].clamp(min=0)
+        g = g - g.narrow(1, 0, 1)  # K does not see a constant, but its sums stay small
+        u = torch.bmm(reference.K.narrow(1, 0, 4), g.unsqueeze(2)).squeeze(2)
+        increment, gain = torch.split_with_sizes(u, (3, 1), 1)
+        return increment / gain.relu()
 
     def fit(self, reference: Reference, g: Tensor) -> Fit:
         """g minus all columns; the gain is the coefficient a of t."""
-        g, t = g - g.mean(-1, keepdim=True), reference.signal[:, 3]
-        u = torch.bmm(reference.K, g[:, :, None]).mT
-        light = (u[:, :, 5:] @ self.light(reference.uv))[:, 0] if self.illumination != "gain" else 0.0
-        constant = u[:, :, 4] - u[:, :, 3] * t.mean(-1, keepdim=True)
-        return Fit(g - constant - torch.bmm(u[:, :, :4], reference.signal)[:, 0] - light * t, u[:, 0, 3])
+        t, g = reference.signal.select(1, 3), g - g.narrow(1, 0, 1)
+        u = torch.bmm(g.unsqueeze(1), reference.K.mT)
+        slopes, gain = u.narrow(2, 0, 4), u[:, 0, 3:4]
+        rest = torch.baddbmm(g.unsqueeze(1), slopes, reference.signal, alpha=-1).squeeze(1)
+        if self.illumination != "gain":
+            light = torch.bmm(u.narrow(2, 5, u.shape[2] - 5), self.light(reference.uv)).squeeze(1)
+            rest.addcmul_(light, t, value=-1)
+        return Fit(rest.sub_(u[:, 0, 4:5] - gain * (t.sum(-1, keepdim=True) / t.shape[1])), gain[:, 0])
 
 
 @dataclass(frozen=True)
@@ -145,7 +149,14 @@ def safe_inverse(matrix: Any) -> tuple[Any, Any]:
     diagonal = xp.diagonal(matrix, 0, -2, -1)
     scale = abs(diagonal).clip(1e-30) ** -0.5
     scale = scale[:, :, None] * scale[:, None, :]
-    inverse = alike(torch.linalg.inv_ex(torch.as_tensor(matrix * scale))[0], matrix)
+    unit = matrix * scale
+    if unit.shape[-1] == 3:  # the adjugate, where LAPACK would take longer to begin
+        twice = xp.concatenate((unit, unit), 1)
+        twice = xp.concatenate((twice, twice), 2)
+        minors = twice[:, 1:4, 1:4] * twice[:, 2:5, 2:5] - twice[:, 1:4, 2:5] * twice[:, 2:5, 1:4]
+        inverse = xp.swapaxes(minors, 1, 2) / (unit[:, :1] * minors[:, :1]).sum(-1)[:, :, None]
+    else:
+        inverse = alike(torch.linalg.inv_ex(torch.as_tensor(unit))[0], matrix)
     regular = (abs(inverse).sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
     return xp.where(regular[:, None, None], inverse * scale, 0.0), regular
 

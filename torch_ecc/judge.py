@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import pi
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not 
 NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
-FIGURES = ("box", "radius", "noise", "alias", "slope", "spread", "inflation", "spread_noise", "noise_share", "moments")
 
 
 class Sums(NamedTuple):
@@ -39,29 +39,29 @@ def judge(
 ) -> Estimate:
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back.
 
-    ``size`` (h, w) of the frame: only pixels inside it count. None if all are known to be. ``start`` and the state are
-    tensors or, on a CPU, numpy arrays.
+    ``size`` (h, w) of the frame: only pixels inside it count. None if all are known to be. ``start``, the state and the
+    record hold tensors or, on a CPU, numpy arrays.
     """
-    pose, whole, xp = state.pose, reference, library(state.pose)
+    pose, whole, xp = state.pose, reference.at_hand, library(state.pose)
     if size is not None:
-        reference = reweigh(reference, inside(torch.as_tensor(warps(reference, pose)), reference.pixels, size))
-    sums = Sums(*(alike(value, pose) for value in add_up(reference, state.patch, settings.min_score)))
-    reference = reference._replace(**{name: alike(getattr(reference, name), pose) for name in FIGURES})
+        seen = torch.as_tensor(inside(warps(reference, pose), reference.pixels, size))
+        reference = reweigh(reference, seen)
+    reference = reference.at_hand
+    sums = add_up(reference, state.patch, settings.min_score)
     gain, power = (xp.where(abs(v) < xp.inf, v, 0.0) for v in (sums.gain, sums.power))
     noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
     structure = clustering(reference, sums.blocks, noise * (1 + gain * gain))
     sampler = interpolation_error(reference, pose, settings.interpolation)
     covariance, fixed = pose_covariance(reference, noise, gain, pose, structure, sampler)
-    shown = reference.moments[:, 1] >= settings.min_visible * alike(whole.moments, pose)[:, 1]
+    shown = reference.moments[:, 1] >= settings.min_visible * whole.moments[:, 1]
     match = (sums.alike >= settings.min_score) & (gain > 0) & (abs(pose) < xp.inf).all(-1)
-    empty = alike(whole.noise, pose) ** 2 * alike(whole.noise_share, pose) > DOUBTFUL_SHARE
+    empty = whole.noise**2 * whole.noise_share > DOUBTFUL_SHARE
     status = decide(shown, match, fixed, state.error <= settings.tolerance, empty)
     good = Status.good(status)
     pose = xp.where(good[:, None], pose, start)
     diagonal = alike(torch.eye(3, device=state.patch.device), start) > 0
     covariance = xp.where(good[:, None, None], covariance, xp.where(diagonal, xp.inf, 0.0))
-    fields = pose, pose - start, sums.score, status, state.iterations, covariance, power**0.5
-    return Estimate(*map(torch.as_tensor, fields))
+    return Estimate(pose, pose - start, sums.score, status, state.iterations, covariance, power**0.5)
 
 
 def decide(shown: Any, match: Any, fixed: Any, converged: Any, empty: Any) -> Any:
@@ -77,25 +77,28 @@ def decide(shown: Any, match: Any, fixed: Any, converged: Any, empty: Any) -> An
 
 
 def add_up(reference: Reference, patch: Tensor, min_score: float) -> Sums:
-    """What there is to know from the pixels (B, N) of B patches."""
+    """What there is to know from the pixels (B, N) of B patches, in the library of the reference's moments."""
+    moments, t, mean = reference.moments, reference.signal.select(1, 3), patch.sum(-1, keepdim=True) / patch.shape[1]
     residual, gain = reference.criterion.fit(reference, patch)
-    weight, total = reference.weight, reference.moments[:, 1].to(patch.dtype)
-    power = dot(weight * residual, residual) / total.clamp(min=1e-30)
-    mean = dot(weight, patch) / total.clamp(min=1e-30)
-    rest = patch - mean[:, None]
-    weighted = weight * rest
-    square, norm = dot(weighted, rest), reference.moments[:, 3].to(patch.dtype)
-    score = dot(weighted, reference.signal[:, 3] - reference.moments[:, 2:3].to(patch.dtype)) / (
-        square.sqrt() * norm
-    ).clamp(min=1e-30)
-    score = torch.where(square.sqrt() * norm > 1e-12 * (square + mean * mean * total), score, 0.0).clamp(-1, 1)
-    alike = score
-    if not host_looks(score.device) or bool((score < min_score).any()):
+    rest = patch - mean
+    weighted, blocks = reference.weight * rest, patch.new_zeros(len(patch), 3, len(reference.block_sizes))
+    blocks.index_add_(2, reference.block, reference.K.narrow(1, 0, 3) * residual.unsqueeze(1))
+    power, (excess, square, along) = (
+        dot(reference.weight * residual, residual),
+        (weighted.sum(-1), dot(weighted, rest), dot(weighted, t)),
+    )
+    gain, mean, power, excess, square, along, blocks = (
+        alike(v, moments) for v in (gain, mean[:, 0], power, excess, square, along, blocks)
+    )
+    xp, total, level, norm = library(moments), moments[:, 1].clip(1e-30), moments[:, 2], moments[:, 3]
+    norm = norm * (square - excess * excess / total).clip(0) ** 0.5
+    score = ((along - excess * level) / norm.clip(1e-30)).clip(-1, 1)
+    score = xp.where(norm > 1e-12 * (square + mean * mean * total), score, 0.0)
+    alike_ = score
+    if not host_looks(patch.device) or (score < min_score).any():
         # Light alone must not make a stranger of the template.
-        alike = torch.maximum(score, flat_correlation(reference, patch))
-    sums = patch.new_zeros(len(patch), 3, len(reference.block_sizes))
-    sums.index_add_(2, reference.block, reference.K[:, :3] * residual[:, None])
-    return Sums(gain, power, score, alike, sums.square().sum(-1))
+        alike_ = xp.maximum(score, alike(flat_correlation(reference, patch), moments))
+    return Sums(gain, power / total, score, alike_, (blocks * blocks).sum(-1))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -154,16 +157,16 @@ def interpolation_error(reference: Reference, pose: Any, interpolation: str) -> 
     """
     if interpolation not in ALIASING:
         return 0.0
-    xp, shift = library(pose), reference.alias[:, ALIASING.index(interpolation)]
-    width, height = reference.box[:2, 2] - reference.box[:2, 0] + 1
-    alike = _alike(xp.cos(pose[:, 2]), width) * _alike(xp.sin(pose[:, 2]), height)
-    return shift @ xp.swapaxes(shift, -1, -2) * (alike * alike / 2)[:, None, None]
+    xp, shift = library(pose), alike(reference.alias, pose)[:, ALIASING.index(interpolation)]
+    sides = alike(reference.box, pose)[:2, 2] - alike(reference.box, pose)[:2, 0] + 1
+    alike_ = _alike(rotation(pose[:, 2])[:, 0], sides).prod(-1)
+    return shift @ xp.swapaxes(shift, -1, -2) * (alike_ * alike_ / 2)[:, None, None]
 
 
 def _alike(step: Any, count: Any) -> Any:
     """Mean of exp(2 pi i k step) over ``count`` neighbours k, but for its phase: 1 for whole steps (Dirichlet)."""
-    step = step - step.round()
-    return library(step).sinc(count * step) / library(step).sinc(step)
+    xp, step = library(step), pi * (step - step.round())
+    return xp.where(step == 0, 1.0, xp.sin(count * step) / (count * xp.sin(step)))
 
 
 def pose_covariance(
@@ -186,9 +189,8 @@ def pose_covariance(
     local = inverse @ spread @ xp.swapaxes(inverse, -1, -2) * noise
     if structure is not None:
         local = local * structure[:, :, None] * structure[:, None, :]
-    zero = xp.zeros_like(pose[:, :2, None])
-    turn = xp.concatenate((rotation(pose[:, 2]), zero), -1)
-    turn = xp.concatenate((turn, xp.swapaxes(xp.concatenate((zero, zero[:, :1] + 1), 1), -1, -2)), 1)
+    turn = 0 * local
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(pose[:, 2]), 1.0
     covariance = turn @ (local + sampler) @ xp.swapaxes(turn, -1, -2)
     corner = covariance[:, 0, 0] + covariance[:, 1, 1] + covariance[:, 2, 2] * reference.radius**2
     return covariance, regular & textured & (corner < LARGEST_SIGMA**2)

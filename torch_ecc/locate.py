@@ -19,10 +19,10 @@ from torch_ecc.bank import Bank, details, search_level
 from torch_ecc.estimate import Estimate, Status
 from torch_ecc.frame import as_gray
 from torch_ecc.judge import flat_correlation
-from torch_ecc.pose import unwrap
+from torch_ecc.pose import Array, unwrap
 from torch_ecc.pyramid import pyramid
 from torch_ecc.reference import Reference
-from torch_ecc.sampling import Bilinear, halve, inside
+from torch_ecc.sampling import Sampler, halve, inside
 from torch_ecc.solver import Settings, State, stage, warps
 
 LEVELS = 8  # of a pyramid at most: it ends where the template gets too small
@@ -206,7 +206,7 @@ def likeness(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
     """Correlation (K,) off the plane of light at poses (K, 3); -1 where too little of the template is in the image."""
     warp = warps(reference, pose)
     weight = reference.weight * inside(warp, reference.pixels, (image.shape[-2], image.shape[-1]))
-    score = flat_correlation(reference._replace(weight=weight), Bilinear(image)(warp, reference.pixels))
+    score = flat_correlation(reference._replace(weight=weight), Sampler(image)(warp, reference.pixels))
     enough = (weight.sum(-1) >= LEAST_SEEN * reference.weight.sum(-1)) & pose.isfinite().all(-1)
     return torch.where(enough, score, -1.0)
 
@@ -258,7 +258,7 @@ def _copies(reference: Reference, count: int) -> Reference:
     return reference.select(torch.zeros(count, dtype=torch.int64, device=reference.K.device))
 
 
-def as_good(score: Tensor, best: Tensor) -> Tensor:
+def as_good(score: Array, best: Array) -> Array:
     """Whether a ``score`` tells no worse match than the ``best`` one, any shape: bool."""
     factor, slack = AS_GOOD
     return 1 - score <= factor * (1 - best) + slack

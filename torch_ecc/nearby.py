@@ -20,7 +20,7 @@ from torch_ecc.estimate import Estimate, Status
 from torch_ecc.pose import compose, rotation
 from torch_ecc.pyramid import as_images
 from torch_ecc.reference import Reference
-from torch_ecc.sampling import Bilinear, inside
+from torch_ecc.sampling import Sampler, inside
 from torch_ecc.solver import Settings
 
 FARTHEST = 24  # px
@@ -113,7 +113,7 @@ class Nearby(NamedTuple):
         turn = rotation(pose[:, 2])
         warp = torch.cat((turn, pose[:, :2, None] + turn @ self.middle[:, :, None]), -1)
         pixels = torch.stack((x.flatten(), y.flatten(), torch.ones_like(x.flatten())))
-        g = Bilinear(image)(warp, pixels).view(-1, *sides)
+        g = Sampler(image)(warp, pixels).view(-1, *sides)
         g = _rows(sides[0], self.shape[0], self.step, g) @ g @ _rows(sides[1], self.shape[1], self.step, g).mT
         return g - g.mean((1, 2), keepdim=True)
 
@@ -173,7 +173,7 @@ def _turned(texture: Tensor, weights: Tensor, turns: Tensor) -> tuple[Tensor, Te
     middle = turns.new_tensor(((w - 1) / 2, (h - 1) / 2))[None, :, None].expand(len(turns), 2, 1)
     warp = torch.cat((rotation(-turns), middle), -1).repeat(b, 1, 1)
     both = torch.stack((texture, weights)).repeat_interleave(len(turns), 1)
-    t, weight = (Bilinear(image)(warp, planes) for image in both)
+    t, weight = (Sampler(image)(warp, planes) for image in both)
     weight = weight * inside(warp, planes, (h, w))
     weighted = planes * weight[:, None]
     inverse, _ = safe_inverse(weighted @ planes.mT)

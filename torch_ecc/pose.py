@@ -38,9 +38,11 @@ def library(array: Any) -> Any:
     return torch if isinstance(array, Tensor) else np
 
 
-def alike(tensor: Tensor, array: Any) -> Any:
-    """``tensor`` in the library and the dtype of ``array``."""
-    return tensor.to(array.dtype) if isinstance(array, Tensor) else tensor.numpy().astype(array.dtype, copy=False)
+def alike(values: Any, array: Any) -> Any:
+    """``values`` in the library and the dtype of ``array``."""
+    if isinstance(array, Tensor):
+        return values.to(array.dtype)
+    return (values.numpy() if isinstance(values, Tensor) else values).astype(array.dtype, copy=False)
 
 
 def rotation(theta: Array) -> Array:
@@ -72,16 +74,18 @@ def transform(pose: Tensor, points: Tensor) -> Tensor:
     return points @ rotation(pose[..., 2]).mT + pose[..., None, :2]
 
 
-def compose(a: Tensor, b: Tensor) -> Tensor:
+def compose(a: Array, b: Array) -> Array:
     """W(a) o W(b), first b and then a: (..., 3), (..., 3) -> (..., 3). Angles add, so turns are kept."""
-    t = a[..., :2] + (rotation(a[..., 2]) @ b[..., :2, None]).squeeze(-1)
-    return torch.cat((t, (a[..., 2] + b[..., 2]).unsqueeze(-1)), -1)
+    t = a[..., :2] + (rotation(a[..., 2]) @ b[..., :2, None])[..., 0]
+    pose: Array = library(a).concatenate((t, a[..., 2:] + b[..., 2:]), -1)
+    return pose
 
 
-def inverse(pose: Tensor) -> Tensor:
+def inverse(pose: Array) -> Array:
     """The pose of W(p)^-1: (..., 3) -> (..., 3)."""
-    t = -(rotation(pose[..., 2]).mT @ pose[..., :2, None]).squeeze(-1)
-    return torch.cat((t, -pose[..., 2:]), -1)
+    t = -(rotation(-pose[..., 2]) @ pose[..., :2, None])[..., 0]
+    back: Array = library(pose).concatenate((t, -pose[..., 2:]), -1)
+    return back
 
 
 def retract(pose: Array, increment: Array) -> Array:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from itertools import chain, repeat
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ from torch_ecc.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.frame import as_gray, as_mask, require_tensor
 from torch_ecc.noise import INSTRUMENT_BLUR, largest_share, noise_response, noise_slope, template_noise, texture_share
 from torch_ecc.pose import pose_dtype
-from torch_ecc.sampling import aliasing, blur, gradients, pad
+from torch_ecc.sampling import aliasing, blur, gradients, on_host, pad
 
 ALIASING = ("bilinear", "bspline3")  # samplers whose own error counts; that of bspline5 does not
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
@@ -37,29 +38,14 @@ BLOCK = 6  # px: side of the blocks over which residuals are taken to cling toge
 PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which takes some 600 bytes on the way
 SMALLEST = 5  # px: side of the smallest template
 PIXELWISE = ("pixels", "signal", "instrument", "trust", "weight")  # beside K; what the sparse pixels have too
+NUMBERS = (  # what is not per pixel
+    *("box", "centre", "radius", "noise", "alias", "slope", "spread", "inflation", "spread_noise", "noise_share"),
+    *("moments", "reach"),
+)
 SHARED = ("criterion", "pixels", "box", "block", "block_sizes", "sparse", "pixels_sparse")  # by all templates
 
 
-class Reference(NamedTuple):
-    """B prepared templates of N pixels under a criterion of p columns.
-
-    ``pixels`` (3, N) homogeneous pixel positions relative to the middle of the template array; ``box`` (3, 4) the
-    corners of their bounding box; ``block`` (N,) the number of the block of neighbours that a pixel is in and
-    ``block_sizes`` (blocks,) how many there are in each; ``centre`` (B, 2) the point x' = 0 in the pixels' coordinates;
-    ``radius`` (B,) px from there to the farthest pixel; ``noise`` (B,) upper estimate of the template's noise, grey
-    levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and blurred, the blurred G times ``trust`` (B, N), see
-    ``texture_share``; ``weight`` (1 or B, N); ``K`` (B, p, N).
-
-    For the covariance: ``alias`` (B, 2, 3, 2), how far aliasing along the template's x and y shifts the pose at most,
-    with the samplers ``ALIASING``; each (B, 3, 3) ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other
-    columns, ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each;
-    ``noise_share`` (B,) is the largest part of ``slope`` that such noise can be, in any direction.
-
-    For the first iterations: ``sparse`` (n,), pixels on a coarser grid; ``K_sparse`` (B, p, n), made from them alone,
-    and what else ``PIXELWISE`` names, there. ``moments`` (B, 7): how many pixels count, the sum of their weights, their
-    weighted mean, the weighted norm of what is left of them, and the square sums of the first rows of K.
-    """
-
+class _Fields(NamedTuple):
     criterion: Criterion
     pixels: Tensor
     box: Tensor
@@ -87,19 +73,55 @@ class Reference(NamedTuple):
     trust_sparse: Tensor
     weight_sparse: Tensor
     moments: Tensor
+    unit: Tensor
+    reach: Tensor
+
+
+class Reference(_Fields):
+    """B prepared templates of N pixels under a criterion of p columns.
+
+    ``pixels`` (3, N) homogeneous pixel positions relative to the middle of the template array; ``box`` (3, 4) the
+    corners of their bounding box; ``block`` (N,) the number of the block of neighbours that a pixel is in and
+    ``block_sizes`` (blocks,) how many there are in each; ``centre`` (B, 2) the point x' = 0 in the pixels' coordinates;
+    ``radius`` (B,) px from there to the farthest pixel; ``noise`` (B,) upper estimate of the template's noise, grey
+    levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and blurred, the blurred G times ``trust`` (B, N), see
+    ``texture_share``; ``weight`` (1 or B, N); ``K`` (B, p, N).
+
+    For the covariance: ``alias`` (B, 2, 3, 2), how far aliasing along the template's x and y shifts the pose at most,
+    with the samplers ``ALIASING``; each (B, 3, 3) ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other
+    columns, ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each;
+    ``noise_share`` (B,) is the largest part of ``slope`` that such noise can be, in any direction.
+
+    For the first iterations: ``sparse`` (n,), pixels on a coarser grid; ``K_sparse`` (B, p, n), made from them alone,
+    and what else ``PIXELWISE`` names, there. ``moments`` (B, 7): how many pixels count, the sum of their weights, their
+    weighted mean, the weighted norm of what is left of them, and the square sums of the first rows of K. ``unit``
+    (B, 2, 3) takes pixels to positions about the centre over half the bounding box; ``reach`` (B, 3): by how many px
+    an increment of 1 in x, y, theta moves the farthest pixel.
+    """
 
     @property
     def uv(self) -> Tensor:
-        """Pixel positions about the centre over half the bounding box, (B, 2, N): the light columns' coordinates."""
-        half = (self.box[:2, 2] - self.box[:2, 0]).clamp(min=1.0) / 2
-        return (self.pixels[:2] - self.centre[:, :, None]) / half[:, None]
+        """The light columns' coordinates: pixel positions in ``unit``, (B, 2, N)."""
+        return self.unit @ self.pixels
 
     @property
     def thin(self) -> Reference:
         """The same templates on their ``sparse`` pixels: all that it takes to come near."""
-        if len(self.sparse) == self.K.shape[-1]:
-            return self
+        return self if len(self.sparse) == self.K.shape[-1] else self._thin
+
+    @property
+    def at_hand(self) -> Reference:
+        """The same with its ``NUMBERS`` in the poses' dtype, where the host may look at them as numpy arrays."""
+        return self._at_hand if isinstance(self.radius, Tensor) else self
+
+    @cached_property
+    def _thin(self) -> Reference:
         return self._replace(**{name: getattr(self, f"{name}_sparse") for name in ("K", *PIXELWISE)})
+
+    @cached_property
+    def _at_hand(self) -> Reference:
+        numbers = {name: getattr(self, name).to(self.radius.dtype) for name in NUMBERS}
+        return self._replace(**{name: on_host(value) for name, value in numbers.items()})
 
     def select(self, index: Tensor | slice) -> Reference:
         """The reference of the templates at ``index`` (n,); of a slice without a copy."""
@@ -223,7 +245,10 @@ def _assemble(
     sparse = ((column % step == 0) & (row % step == 0)).nonzero()[:, 0]
     kept_here = sparse if step > 1 else sparse[:0]  # all of them are the template itself
     few = [v[..., kept_here] for v in (pixels, signal, instrument, trust[:, 0], weight)]
-    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, signal, *few, radius)
+    half = (box[:2, 2] - box[:2, 0]).clamp(min=1.0)[:, None] / 2
+    unit = torch.cat((torch.eye(2).to(half).expand(len(images), 2, 2), -centre[:, :, None]), -1) / half
+    reach = torch.stack((torch.ones_like(radius), torch.ones_like(radius), radius), -1)
+    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, signal, *few, radius, unit, reach)
     reference = reweigh(Reference(criterion, *constants, *rest), weight > 0)
     thin = reference.thin
     return reference._replace(K_sparse=reference.K if thin is reference else reweigh(thin, thin.weight > 0).K)

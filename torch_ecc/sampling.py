@@ -6,7 +6,9 @@ pixel centres at integers, and a warp is a 2x3 matrix that takes homogeneous tem
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Sequence
+from functools import lru_cache, reduce
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,9 +17,10 @@ import torch.nn.functional as F
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
-from torch_ecc.pose import alike
+from torch_ecc.pose import alike, pose_dtype
 
-REACH = 10  # px around a patch that its B-spline still feels: 0.43 ** 10 = 2e-4 of the border's contrast, at degree 5
+# px around a patch: in which bilinear iterations may move it; and that its B-spline still feels, of degree 3 and 5:
+REACH = {1: 16, 3: 7, 5: 10}  # 0.27 ** 7 and 0.43 ** 10 are 1e-4 and 2e-4 of the border's contrast
 LOOKED_AT = {"cpu"}  # devices that let the host see a value without waiting for it
 TAPS = {3: (4 / 6, 1 / 6), 5: (66 / 120, 26 / 120, 1 / 120)}  # centred B-splines at 0, 1, 2
 SLOPE = {3: (0.0, 1 / 2), 5: (0.0, 10 / 24, 1 / 24)}  # minus their derivatives there
@@ -25,74 +28,65 @@ SLOPE = {3: (0.0, 1 / 2), 5: (0.0, 10 / 24, 1 / 24)}  # minus their derivatives 
 NOISE_GAIN = {"bilinear": 4 / 9, "bspline3": 0.7643, "bspline5": 0.8427}
 
 
-class Bilinear(NamedTuple):
-    """Bilinear sampler of ``image`` (I, 1, H, W), I = 1 (shared by all templates, not copied) or one per template.
+class Sampler(NamedTuple):
+    """Values of images between their pixels, bilinear (``degree`` 1) or by the interpolating B-spline (3, 5).
 
-    ``edge``: the frame's size (h, w) if templates may reach beyond it, None if all are known to lie inside.
+    ``values`` (I, 1, h, w), the image or the B-spline's coefficients, I = 1 (shared by all, not copied) or one per
+    template. ``origin`` (I, 2, 3): what to subtract from a warp to count from value (0, 0), so that coordinates stay
+    small and float32 holds 1e-5 px. ``edge``: the frame's size (h, w) if templates may reach beyond it.
     """
 
-    image: Tensor
-    edge: tuple[int, int] | None = None
-
-    def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
-        """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside the image its border repeats."""
-        scale, shift = _unit_square(*self.image.shape[-2:], warp.dtype, warp.device)
-        points = torch.addcmul(shift, warp, scale).to(pixels.dtype) @ pixels
-        return _lookup(self.image, points)
-
-    def select(self, index: Tensor) -> Bilinear:
-        """The sampler of some of the templates."""
-        return self if len(self.image) in (1, len(index)) else self._replace(image=self.image[index])
-
-
-class BSpline(NamedTuple):
-    """Sampler of the interpolating B-spline of ``degree`` 3 or 5, from its coefficients (I, 1, h, w).
-
-    ``origin`` (I, 2) is the frame position of coefficient (0, 0): coordinates stay small, so float32 holds 1e-5 px.
-    """
-
-    coefficients: Tensor
-    origin: Tensor
-    degree: int
+    values: Tensor
+    degree: int = 1
+    origin: Tensor | None = None
     edge: tuple[int, int] | None = None
 
     @staticmethod
-    def of(image: Tensor, degree: int, corner: Tensor | None = None) -> BSpline:
+    def of(image: Tensor, degree: int, corner: Tensor | None = None) -> Sampler:
         """Of an ``image`` (I, 1, h, w) whose pixel (0, 0) lies at ``corner`` (I, 2), by default the origin."""
-        ring = degree // 2
-        corner = torch.zeros(1, 2, device=image.device) if corner is None else corner
-        return BSpline(prefilter(image, degree, ring), corner - ring, degree)
+        ring, corner = degree // 2, torch.zeros(1, 2, device=image.device) if corner is None else corner
+        values = prefilter(image, degree, ring) if ring else image
+        return Sampler(values, degree, F.pad((corner - ring).unsqueeze(-1), (2, 0)))
 
-    def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
-        """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N).
+    def __call__(self, warp: Any, pixels: Tensor) -> Tensor:
+        """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside, its border repeats."""
+        local, in_torch = self._local(warp), isinstance(warp, Tensor) or self.degree > 1
+        scale, shift = _unit_square(*self.values.shape[-2:], self.values.device, in_torch)
+        if self.degree == 1:
+            return _lookup(self.values, _points(local * scale + shift, pixels))
+        return self._spline(_points(local, pixels), scale.float())
+
+    def _local(self, warp: Any) -> Any:
+        """``warp`` (B, 2, 3) to coordinates that count from the origin."""
+        return warp if self.origin is None else warp - alike(self.origin, warp)
+
+    def _spline(self, points: Tensor, scale: Tensor) -> Tensor:
+        """Values (B, N) at ``points`` (B, 2, N).
 
         A B-spline is non-negative, so each pair of neighbouring taps is one bilinear lookup at their centre of mass
         (Ruijters et al., 2008): (degree + 1)^2 / 4 lookups instead of (degree + 1)^2 gathers.
         """
-        local = torch.cat((warp[:, :, :2], warp[:, :, 2:] - self.origin[:, :, None]), -1)
-        points = local.to(pixels.dtype) @ pixels
-        scale, shift = _unit_square(*self.coefficients.shape[-2:], points.dtype, points.device)
-        floor, value = points.floor(), torch.zeros_like(points[:, 0])
-        pairs = []  # per pair of taps: total weight and normalised coordinate of their lookup, both (B, 2, N)
-        for first, total, second in _pairs(points - floor, self.degree):
-            at = torch.div(second, total).add_(floor).add_(first)
-            pairs.append((total, torch.addcmul(shift[:, 2:], at, scale)))
-        for wy, y in pairs:
-            row = torch.zeros_like(value)
-            for wx, x in pairs:
-                look = _lookup(self.coefficients, torch.stack((x[:, 0], y[:, 1]), 1))
-                row.addcmul_(look, wx[:, 0])
-            value.addcmul_(row, wy[:, 1])
-        return value
+        floor = points.floor()
+        pairs = _pairs(points.sub_(floor), self.degree)
+        n = len(pairs)
+        at = points.new_empty(len(points), 2 * n, points.shape[-1])  # x of each pair of columns, then y of each of rows
+        for k, (first, total, second) in enumerate(pairs):
+            torch.mul(torch.addcdiv(floor, second, total).add_(first), scale, out=at[:, k::n])
+        at.sub_(1)
+        wx, wy = zip(*(total.unbind(1) for _, total, _ in pairs), strict=True)
+        rows = [[_lookup(self.values, at[:, i : n + j + 1 : n + j - i]) for i in range(n)] for j in range(n)]
+        return _sum([_sum(row, wx) for row in rows], wy)
 
-    def select(self, index: Tensor) -> BSpline:
+    def covers(self, warp: Any, box: Any, margin: float) -> Any:
+        """Whether ``box`` (3, 4) at ``warp`` (B, 2, 3) lies ``margin`` px inside of what was sampled, (B,) bool."""
+        return inside(self._local(warp), box, self.values.shape[-2:], margin + self.degree // 2).all(-1)
+
+    def select(self, index: Tensor) -> Sampler:
         """The sampler of some of the templates."""
-        if len(self.coefficients) in (1, len(index)):
+        if len(self.values) in (1, len(index)):
             return self
-        return self._replace(coefficients=self.coefficients[index], origin=self.origin[index])
-
-
-Sampler = Bilinear | BSpline
+        origin = self.origin[index] if self.origin is not None and len(self.origin) > 1 else self.origin
+        return self._replace(values=self.values[index], origin=origin)
 
 
 def host_looks(device: torch.device) -> bool:
@@ -103,28 +97,34 @@ def host_looks(device: torch.device) -> bool:
     return device.type in LOOKED_AT
 
 
-def make_sampler(interpolation: str, image: Tensor, warp: Any, box: Tensor) -> Sampler:
+def on_host(tensor: Tensor) -> Any:
+    """``tensor`` as numpy sees it, without a copy, where the host may look at it; itself elsewhere.
+
+    A call of numpy on a few numbers takes a quarter of the time of torch's.
+    """
+    return tensor.numpy() if host_looks(tensor.device) else tensor
+
+
+def make_sampler(interpolation: str, image: Tensor, warp: Any, box: Any) -> Sampler:
     """The sampler of ``image`` (I, 1, H, W) around the patches ``warp`` (B, 2, 3) of the template rectangle.
 
-    ``box`` (3, 4): the rectangle's corners. A B-spline is prefiltered only in the neighbourhood of the patches, unless
-    so many share one image that filtering all of it is less work; on an accelerator always all of it.
+    ``box`` (3, 4): the rectangle's corners. Only the neighbourhoods of the patches are converted and prefiltered,
+    unless so many share one image that all of it is less work; on an accelerator always all of it.
     """
-    if interpolation == "bilinear":
-        return Bilinear(image.float())
-    degree, (h, w) = int(interpolation[-1]), image.shape[-2:]
-    if host_looks(image.device):
-        corners = np.asarray(warp) @ np.asarray(box)
-        low = np.floor(corners.min(-1)) - REACH
-        extent = int((np.ceil(corners.max(-1)) + REACH - low).max()) + 1
+    degree, (h, w) = 1 if interpolation == "bilinear" else int(interpolation[-1]), image.shape[-2:]
+    if host_looks(image.device) and not (degree == 1 and image.dtype == torch.float32):
+        corners, reach = np.asarray(warp) @ np.asarray(box), REACH[degree]
+        low = np.floor(corners.min(-1)) - reach
+        extent = int((np.ceil(corners.max(-1)) + reach - low).max()) + 1
         side = -(-extent // 8) * 8  # few different sizes, so that the prefilter matrices are reused
-        shared = len(image) == 1 and len(warp) * 2 * side**3 >= h * w * (h + w)
-        if not shared and side <= min(h, w):
-            low = np.clip(low, 0, (w - side, h - side)).astype(int)  # what lies beyond is not sampled
-            return BSpline.of(_crop(image, low, side), degree, torch.from_numpy(low))
-    return BSpline.of(image.float(), degree)
+        part, whole = (side * side, h * w) if degree == 1 else (2 * side**3, h * w * (h + w))
+        if side <= min(h, w) and (len(image) > 1 or len(warp) * part < whole):
+            low = low.clip(0, (w - side, h - side)).astype(int)  # what lies beyond is not sampled
+            return Sampler.of(_crop(image, low, side), degree, torch.from_numpy(low).double())
+    return Sampler.of(image.float(), degree)
 
 
-def inside(warp: Any, pixels: Tensor, size: tuple[int, int], margin: float = 0.0) -> Any:
+def inside(warp: Any, pixels: Any, size: Sequence[int], margin: float = 0.0) -> Any:
     """Which ``pixels`` (3, N) the ``warp`` (B, 2, 3) puts at least ``margin`` px inside a frame (h, w): bool (B, N)."""
     points = warp @ alike(pixels, warp)
     x, y = points[:, 0], points[:, 1]
@@ -134,8 +134,9 @@ def inside(warp: Any, pixels: Tensor, size: tuple[int, int], margin: float = 0.0
 
 def _crop(image: Tensor, origin: Any, side: int) -> Tensor:
     """Squares (B, 1, side, side), float, of ``image`` (1 or B, 1, H, W) from ``origin`` (B, 2) = (x, y), all inside."""
-    views = zip(image.expand(len(origin), -1, -1, -1), origin.tolist(), strict=True)
-    return torch.stack([view[:, y : y + side, x : x + side] for view, (x, y) in views]).float()
+    frames, side_by_side = image.detach().numpy()[:, 0], zip(cycle(range(len(image))), origin.tolist(), strict=False)
+    crops = np.stack([frames[b, y : y + side, x : x + side] for b, (x, y) in side_by_side])
+    return torch.from_numpy(crops.astype(np.float32))[:, None]
 
 
 def _mirror(index: Tensor, size: int) -> Tensor:
@@ -145,16 +146,33 @@ def _mirror(index: Tensor, size: int) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-def _unit_square(h: int, w: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+@torch.inference_mode(False)
+def _unit_square(h: int, w: int, device: torch.device, in_torch: bool) -> tuple[Any, Any]:
     """Scale (2, 1) and shift (2, 3) of warps from px to grid_sample's coordinates: -1 and 1 at the outer pixels."""
-    scale = torch.tensor([[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]], dtype=dtype, device=device)
-    return scale, torch.tensor([[0, 0, -1.0]] * 2, dtype=dtype, device=device)
+    both = [[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]], [[0, 0, -1.0]] * 2
+    scale, shift = (torch.tensor(rows, dtype=pose_dtype(device), device=device) for rows in both)
+    return (scale, shift) if in_torch else (scale.numpy(), shift.numpy())
+
+
+def _points(warp: Any, pixels: Tensor) -> Tensor:
+    """Where the ``warp`` (B, 2, 3), a tensor or numpy array, takes ``pixels`` (3, N): (B, 2, N), float32."""
+    rows = warp.reshape(-1, 3)
+    rows = rows.to(pixels.dtype) if isinstance(rows, Tensor) else torch.from_numpy(rows.astype(np.float32))
+    return torch.mm(rows, pixels).view(len(warp), 2, -1)
 
 
 def _lookup(image: Tensor, points: Tensor) -> Tensor:
     """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, 2, N): (B, N). Its border repeats."""
-    image, grid = image.expand(len(points), -1, -1, -1), points.mT[:, None]
-    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[:, 0, 0]
+    image = image if len(image) == len(points) else image.expand(len(points), -1, -1, -1)
+    grid = points.mT.unsqueeze(1)
+    values = F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)
+    return values.view(len(points), -1)
+
+
+def _sum(values: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
+    """Sum of values times weights, in place of the first value."""
+    values[0].mul_(weights[0])
+    return reduce(lambda total, pair: total.addcmul_(*pair), zip(values[1:], weights[1:], strict=True), values[0])
 
 
 def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
@@ -164,8 +182,9 @@ def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
     if degree == 1:
         return [(0, torch.ones_like(f), f)]
     if degree == 3:
-        left, right = (r * r).mul_(r).div_(6), (f * f).mul_(f).div_(6)
-        high = torch.rsub(f, 0.5, alpha=1 / 3).mul_(f).add_(0.5).mul_(f).add_(1 / 6)
+        square = f * f
+        left, right = (r * r).mul_(r).mul_(1 / 6), (square * f).mul_(1 / 6)
+        high = square.add_(f).mul_(0.5).sub_(right, alpha=2).add_(1 / 6)
         low = 1 - high
         return [(-1, low, low - left), (1, high, right)]
     w = [
@@ -180,6 +199,7 @@ def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)
 def _spline_matrices(n: int, degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Prefilter (n, n): samples to B-spline coefficients, mirrored at the border; and slope (n, n) at the samples."""
     index = torch.arange(n)
@@ -203,6 +223,7 @@ def prefilter(image: Tensor, degree: int, ring: int = 0) -> Tensor:
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)
 def _prefilter_matrix(n: int, degree: int, ring: int, device: torch.device) -> Tensor:
     index = _mirror(torch.arange(-ring, n + ring, device=device), n)
     return _spline_matrices(n, degree, device)[0][index]

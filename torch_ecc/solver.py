@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,24 +55,25 @@ class Settings:
 
 
 class State(NamedTuple):
-    """Of B templates: ``pose`` (B, 3), the last increment ``delta`` (B, 3) in px at the farthest pixel and the
-    ``factor`` (B,) that it was stretched by, the predicted remaining ``error`` (B,) in px there, ``iterations`` (B,)
-    and the last sampled ``patch`` (B, N). On a CPU all but the patch are numpy arrays while they are iterated: a call
-    of numpy on three numbers takes a quarter of the time of torch's."""
+    """Of B templates: ``pose`` (B, 3), the last increment ``delta`` (B, 3) in px at the farthest pixel, its ``length``
+    (B,) and the ``factor`` (B,) that it was stretched by, the predicted remaining ``error`` (B,) in px there,
+    ``iterations`` (B,) and the last sampled ``patch`` (B, N), None before the first. On a CPU all but the patch are
+    numpy arrays while they are iterated."""
 
     pose: Any
     delta: Any
+    length: Any
     factor: Any
     error: Any
     iterations: Any
-    patch: Tensor
+    patch: Any
 
     @staticmethod
     def start(reference: Reference, pose: Any) -> State:
         """Before the first iteration."""
         xp = library(pose)
         one, count = xp.ones_like(pose[:, 0]), xp.zeros_like(pose[:, 0], dtype=xp.int64)
-        return State(pose, xp.zeros_like(pose), one, one * xp.inf, count, reference.K[:, 0])
+        return State(pose, xp.zeros_like(pose), 0 * one, one, one * xp.inf, count, None)
 
     def convert(self, function: Callable[[Any], Any]) -> State:
         """The state in the other library, by ``Tensor.numpy`` or ``torch.from_numpy``."""
@@ -99,33 +101,28 @@ def warps(reference: Reference, pose: Array) -> Array:
 def gauss_newton(reference: Reference, sample: Sampler, state: State, tolerance: float) -> State:
     """One iteration. Elements whose predicted error is below ``tolerance`` already stay as they are."""
     xp, pose, busy = library(state.pose), state.pose, state.error > tolerance
-    warp = torch.as_tensor(warps(reference, pose))
+    warp = warps(reference, pose)
     g = look(sample, warp, reference.pixels, state.patch, busy)  # I(W(p_k; x'))
-    seen = reference if sample.edge is None else reweigh(reference, inside(warp, reference.pixels, sample.edge))
-    increment = alike(seen.criterion.step(seen, g), pose)  # eq. (9), or a better one
-    radius = alike(reference.radius, pose)
-    delta = xp.concatenate((increment[:, :2], increment[:, 2:] * radius[:, None]), -1)
+    if sample.edge is not None:
+        reference = reweigh(reference, torch.as_tensor(inside(warp, reference.pixels, sample.edge)))
+    increment, reach = alike(reference.criterion.step(reference, g), pose), alike(reference.reach, pose)  # eq. (9)
+    delta = increment * reach
     length = norm(delta)
     moving = (length < xp.inf) & busy  # NaN compares as not moving
     factor, rate = secant(state, delta, length)
-    stretch = xp.minimum(factor, LONGEST_STEP * radius / length)
-    moved = retract(pose, increment * stretch[:, None])  # eq. (10)
-    return State(
-        xp.where(moving[:, None], moved, pose),
-        xp.where(moving[:, None], delta, state.delta),
-        xp.where(moving, stretch, state.factor),
-        xp.where(moving, length * stretch * rate / (1 - rate), 0.0),
-        state.iterations + moving,
-        g,
-    )
+    stretch = xp.minimum(factor, LONGEST_STEP * reach[:, 2] / length)
+    moved = retract(pose, xp.where(moving[:, None], increment * stretch[:, None], 0.0))  # eq. (10)
+    error = xp.where(moving, length * stretch * rate / (1 - rate), 0.0)
+    length, stretch = xp.where(moving, length, state.length), xp.where(moving, stretch, state.factor)
+    return State(moved, delta, length, stretch, error, state.iterations + moving, g)
 
 
-def look(sample: Sampler, warp: Tensor, pixels: Tensor, patch: Tensor, busy: Any) -> Tensor:
+def look(sample: Sampler, warp: Any, pixels: Tensor, patch: Tensor | None, busy: Any) -> Tensor:
     """The patches (B, N) at ``warp`` (B, 2, 3); where the host knows who is ``busy`` (B,), the others are as before."""
     if isinstance(busy, Tensor) or busy.all():
         return sample(warp, pixels)
-    index = torch.from_numpy(busy.nonzero()[0])
-    return patch.index_copy(0, index, sample.select(index)(warp[index], pixels))
+    index, patch = busy.nonzero()[0], pixels.new_zeros(len(busy), pixels.shape[1]) if patch is None else patch
+    return patch.index_copy(0, torch.from_numpy(index), sample.select(index)(warp[index], pixels))
 
 
 def norm(vector: Any) -> Any:
@@ -141,12 +138,11 @@ def secant(state: State, delta: Any, length: Any) -> tuple[Any, Any]:
     within one stage: another sampler or other pixels have another answer, to which the first step is no part of it. Of
     that step the earlier stage tells what it leaves: the share that its steps did not cover.
     """
-    xp, last = library(delta), norm(state.delta)
-    first = ~(state.error < xp.inf)
+    xp, last, first = library(delta), state.length, ~(state.error < inf)
     rate = xp.where(last > 0, length / last, 0.5)
     rate = xp.where(first & (state.factor > 1), 1 - 1 / state.factor, rate).clip(0.05, 0.95)
     along = (state.delta * delta).sum(-1) / (last * last)  # = 1 - (last stretch) * (share that a step covers)
-    usable = (last < SECANT_RANGE) & (along < 0.9) & (state.error < xp.inf)
+    usable = (last < SECANT_RANGE) & (along < 0.9) & ~first
     return xp.where(usable, (state.factor / (1 - along)).clip(1.0, LARGEST_STRETCH), 1.0), rate
 
 
@@ -155,12 +151,12 @@ def iterate(reference: Reference, sample: Sampler, state: State, tolerance: floa
 
     An accelerator does them all, so that the host need not know: what has converged is masked.
     """
-    state = state._replace(patch=torch.zeros_like(reference.K[:, 0]))
+    state = state._replace(patch=None)
     for _ in range(budget):
         if host_looks(reference.K.device) and not (state.error > tolerance).any():
             break
         state = gauss_newton(reference, sample, state, tolerance)
-    return state
+    return state if state.patch is not None else state._replace(patch=torch.zeros_like(reference.K[:, 0]))
 
 
 @np.errstate(all="ignore")
@@ -170,18 +166,18 @@ def refine(reference: Reference, image: Tensor, state: State, settings: Settings
     And which templates (B,) are settled: all with ``border``; without it no pixel may drop out of sight, and those
     that come near the border are left alone.
     """
-    size, xp = (image.shape[-2], image.shape[-1]), library(state.pose)
-    settled = xp.ones_like(state.pose[:, 0]) > 0
-    for part, interpolation, tolerance, budget in stages(reference, settings):
+    size, xp, sample = (image.shape[-2], image.shape[-1]), library(state.pose), None
+    warp, todo = warps(reference, state.pose), stages(reference, settings)
+    settled = xp.ones_like(state.pose[:, 0]) > 0 if border else inside(warp, reference.box, size, margin=EDGE).all(-1)
+    for part, interpolation, tolerance, budget in todo:
         if border:
             state = stage(part, image, state, interpolation, tolerance, budget)
             continue
+        if sample is None or interpolation != "bilinear":
+            sample = make_sampler(interpolation, image, warp, reference.box)
+        state = iterate(part, sample, state._replace(error=xp.where(settled, xp.inf, 0.0)), tolerance, budget)
         warp = warps(reference, state.pose)
-        settled = settled & inside(warp, reference.box, size, margin=EDGE).all(-1)
-        state = state._replace(error=xp.where(settled, xp.inf, 0.0))
-        state = iterate(part, make_sampler(interpolation, image, warp, reference.box), state, tolerance, budget)
-    if not border:
-        settled = settled & inside(warps(reference, state.pose), reference.box, size).all(-1)
+        settled = settled & sample.covers(warp, reference.box, 0 if part is todo[-1][0] else EDGE)
     return state, settled
 
 

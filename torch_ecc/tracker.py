@@ -17,9 +17,10 @@ from torch_ecc.frame import as_device, as_gray, as_image
 from torch_ecc.locate import LEAST_SEEN, Located, Locator, as_good, halvings, likeness
 from torch_ecc.nearby import Nearby
 from torch_ecc.patches import Centers, Size, cut, locate_patches
-from torch_ecc.pose import compose, inverse, unwrap
+from torch_ecc.pose import compose, inverse, library, unwrap
 from torch_ecc.pyramid import SMALLEST_COARSE, pyramid
 from torch_ecc.reference import Reference
+from torch_ecc.sampling import on_host
 from torch_ecc.solver import Settings, State, stage
 
 STATE = ("pose", "velocity", "start", "score", "tracked", "doubted")  # in the order of native.track
@@ -191,39 +192,37 @@ class Tracker(nn.Module):
     @torch.no_grad()
     def _beyond(self, image: Tensor, estimate: Estimate | None) -> Estimate:
         """What a frame needs more: the torch path if there is no ``estimate`` yet, and searches."""
-        images, start = [image.float()], compose(self.pose, self.velocity)
+        buffers: Any = self._buffers
+        images, state = [image], {name: on_host(buffers[name]) for name in STATE}
+        start = torch.as_tensor(compose(state["pose"], state["velocity"]))
         if estimate is None:
             estimate = self._solve(images, start)
-        due = self._due(self._strange(estimate)) if self.search else []
+        strange = _strange(estimate, state["score"])
+        due = self._due(strange) if self.search else []
         if due:
+            images[0] = images[0].float()
             estimate = self._look_near(images[0], estimate, start, sorted(due))
-            strange = self._strange(estimate).tolist()
+            strange = _strange(estimate, state["score"]).tolist()
             for r in [r for r in due if strange[r]][:AT_ONCE]:
                 estimate = self._search(images, estimate, r)
-        return self._advance(estimate)
+            strange = _strange(estimate, state["score"])
+        return self._advance(estimate, state, strange)
 
     def _solve(self, images: list[Tensor], pose: Tensor) -> Estimate:
-        """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are.
-
-        What a level has found is kept only if it looks better than its start to the next finer one: fine texture is
-        not there in a coarse level, which then leads anywhere.
-        """
-        images += halvings(images[-1], self.levels)[1:]
-        double, budget = pose.new_tensor((2.0, 2.0, 1.0)), self.settings.max_iterations
-        pose = pose / double ** (self.levels - 1)
+        """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are. What a level has found
+        is kept only if it looks better to the next finer one than its start: fine texture is not there in a coarse
+        level, which then leads anywhere."""
+        images[:] = halvings(images[0].float(), self.levels) if self.levels > 1 else images
         for level in range(self.levels - 1, 0, -1):
-            state = State.start(self.references[level], pose)
+            scale, budget = pose.new_tensor((2.0**level, 2.0**level, 1.0)), self.settings.max_iterations
+            state = State.start(self.references[level], pose / scale)
             state = stage(self.references[level], images[level], state, "bilinear", COARSE_TOLERANCE, budget)
-            pose, coarse, finer = pose * double, state.pose * double, (self.references[level - 1], images[level - 1])
-            better = likeness(*finer, coarse) > likeness(*finer, pose)
-            pose = torch.where(better[:, None], coarse, pose)
+            double, finer = pose.new_tensor((2.0, 2.0, 1.0)), (self.references[level - 1], images[level - 1])
+            better = likeness(*finer, state.pose * double) > likeness(*finer, pose / scale * double)
+            pose = torch.where(better[:, None], state.pose * scale, pose)
         return solve(self.references[0], images[0], pose, self.settings)
 
-    def _strange(self, estimate: Estimate) -> Tensor:
-        """Templates that were not found, or look less like themselves than usual: perhaps a wrong place, (R,) bool."""
-        return ~Status.good(estimate.status) | ~as_good(estimate.score, self.score)
-
-    def _due(self, strange: Tensor) -> list[int]:
+    def _due(self, strange: Any) -> list[int]:
         """Which of the ``strange`` templates (R,) to search for in this frame."""
         doubted = self.doubted.tolist() if bool(strange.any()) else []
         due = [r for r, n in enumerate(doubted) if strange[r] and n % min(2 ** (n // PATIENCE), SELDOM) == 0]
@@ -264,16 +263,24 @@ class Tracker(nn.Module):
         index = torch.tensor([r], device=self.pose.device)
         return estimate.put(index, best.at(index.new_zeros(1)))
 
-    def _advance(self, estimate: Estimate) -> Estimate:
-        good = Status.good(estimate.status)[:, None]
-        pose = torch.where(good, estimate.pose, self.pose)
+    def _advance(self, estimate: Estimate, state: dict[str, Any], strange: Any) -> Estimate:
+        """One frame on: the next state, and the ``estimate`` with the last good pose of what was not found."""
+        last, score, good = state["pose"], state["score"], Status.good(on_host(estimate.status))
+        xp, known = library(last), good[:, None]
+        pose = xp.where(known, on_host(estimate.pose), last)
         if self.prediction == "velocity":
             # The last step in the template's own axes: exact for a constant turn about any point of the stage.
-            self.velocity = torch.where(good & self.tracked[:, None], compose(inverse(self.pose), pose), 0.0)
-        self.pose, self.tracked = pose, good[:, 0]
-        self.doubted = torch.where(self._strange(estimate), self.doubted + 1, 0)
-        self.score = torch.where(good[:, 0], torch.lerp(self.score, estimate.score, MEMORY), self.score)
-        return estimate._replace(pose=pose.clone(), displacement=pose - self.start)
+            state["velocity"] = xp.where(known & state["tracked"][:, None], compose(inverse(last), pose), 0.0)
+        usual = xp.where(good, score + MEMORY * (on_host(estimate.score) - score), score)
+        state |= {"pose": pose, "score": usual, "tracked": good, "doubted": xp.where(strange, state["doubted"] + 1, 0)}
+        self._buffers.update({name: torch.as_tensor(value) for name, value in state.items()})
+        kept, moved = torch.as_tensor(pose).clone(), torch.as_tensor(pose - state["start"])
+        return estimate._replace(pose=kept, displacement=moved)
+
+
+def _strange(estimate: Estimate, usual: Any) -> Any:
+    """Templates that were not found, or look less like themselves than usual: perhaps a wrong place, (R,) bool."""
+    return ~(Status.good(on_host(estimate.status)) & as_good(on_host(estimate.score), usual))
 
 
 def expected_score(reference: Reference) -> Tensor:
