@@ -1,7 +1,6 @@
 // torch_ecc/judge.py for one template that lies wholly in the frame: see there for the formulae and the constants.
 #pragma once
 #include <array>
-#include <numeric>
 
 #include "solve.h"
 
@@ -56,23 +55,20 @@ struct Remains {  // of a patch v after the fit, and before it: weighted sums, a
   double clustered[3];       // of the squared sums over blocks
 };
 
-// From the sums of the last look, r = v - R^T model, and the fit e = r - R^T change. What e has along G is nothing but
-// chance, as it is nothing along Z; along the other columns it is known.
+// From the sums of the last look, r = v - R^T model, and the fit e = r - R^T change.
 inline Remains remains(const Template& t, Scratch& scratch) {
   const Pixels& p = t.whole;
-  const Sums& sums = scratch.sums;
   const Coefficients &model = scratch.model, &change = scratch.change;
-  const auto gram = [&](int c, const Coefficients& u) { return std::inner_product(u.begin(), u.end(), t.gram[c], 0.0); };
   Remains out{};
-  out.square = out.vv = sums.squares;
-  for (int c = 0; c < MOST; ++c) {  // along the column c: of r, and what the fit takes away
-    const double of_r = c == 4 ? sums.z[4] : sums.r[c] * p.grey, taken = gram(c, change), of_v = of_r + gram(c, model);
-    out.square -= change[c] * (c < 3 ? taken : 2 * of_r - taken);
-    if (c > 2) out.vv += model[c] * (of_r + of_v);
+  double moved;
+  out.square = left_over(t, scratch, moved);
+  out.vv = scratch.sums.squares;
+  for (int c = 3; c < MOST; ++c) {
+    const double of_r = along(t, c, scratch.sums), of_v = of_r + along(t, c, model);
+    out.vv += model[c] * (of_r + of_v);
     if (c == 3) out.vt = of_v;
     if (c == 4) out.v = of_v;
   }
-  out.square = std::max(out.square, 0.0);
   const int64_t columns = 5 + t.light(), pitch = t.parts_pitch;
   const int16_t* part = t.at<int16_t>(t.parts);
   const float* lines = scratch.lines.data();

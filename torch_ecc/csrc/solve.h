@@ -1,10 +1,13 @@
 // The loop of torch_ecc/solver.py for one template: see there for the reasons behind each step and constant.
 #pragma once
+#include <numeric>
+
 #include "template.h"
 
 namespace ecc {
 
 constexpr double COARSE_TOLERANCE = 0.02, SECANT_RANGE = 1.0, LARGEST_STRETCH = 5.0, LONGEST_STEP = 0.2;
+constexpr double CLEAR = 0.1;  // share of what is left of a patch
 constexpr double EDGE = 4, INFINITE = HUGE_VAL;
 constexpr double MEMORY = 0.05, WORSE = 1.5, SLACK = 0.01;  // tracker.MEMORY, locate.AS_GOOD
 
@@ -165,12 +168,39 @@ inline void advance(const Template& t, const double (&step)[3], State& state) {
   state.iterations += 1;
 }
 
+// R W R^T u, and R W r, from the column t on, of the last look at a whole template.
+inline double along(const Template& t, int c, const Coefficients& u) {
+  return std::inner_product(u.begin(), u.end(), t.gram[c], 0.0);
+}
+
+inline double along(const Template& t, int c, const Sums& sums) { return c == 4 ? sums.z[4] : sums.r[c] * t.whole.grey; }
+
+// e W e of e = r - R^T change. What e has along G is nothing but chance, as it is nothing along Z; along the other
+// columns it is known. `moved`: the step's part of R^T change alone, squared.
+inline double left_over(const Template& t, const Scratch& scratch, double& moved) {
+  double rest = scratch.sums.squares;
+  moved = 0;
+  for (int c = 0; c < MOST; ++c) {
+    const double taken = along(t, c, scratch.change);
+    rest -= scratch.change[c] * (c < 3 ? taken : 2 * along(t, c, scratch.sums) - taken);
+    if (c < 3) moved += scratch.change[c] * taken;
+  }
+  return std::max(rest, 0.0);
+}
+
+// Whether chance may be much of what is left: in frames with next to no noise, after a step that is not small.
+inline bool vague(const Template& t, const Scratch& scratch) {
+  double moved;
+  return CLEAR * left_over(t, scratch, moved) < moved;
+}
+
 template <int degree, bool whole>
-void iterate(const Template& t, const Frame& frame, double tolerance, int64_t budget, State& state, Scratch& scratch) {
+void iterate(const Template& t, const Frame& frame, double tolerance, int64_t budget, bool last, State& state,
+             Scratch& scratch) {
   const Pixels& p = whole ? t.whole : t.thin;
   state.error = INFINITE;
   for (int64_t row = 0; row < BLOCK; ++row) fetch(t, p, row);
-  for (int64_t k = 0; k < budget && state.error > tolerance; ++k) {
+  for (int64_t k = 0; k < budget && (state.error > tolerance || (last && vague(t, scratch))); ++k) {
     const Warp warp = warp_of(state.pose);
     cover<degree>(t, frame, warp, scratch.window, k == 0);
     look<degree, whole>(t, warp, state.iterations == 0, scratch);
@@ -195,15 +225,15 @@ inline bool refine(const Template& t, const Frame& frame, const Settings& set, S
     const int64_t coarse = std::max<int64_t>(budget * 2 / 3, 1);
     const double near = std::max(set.tolerance, COARSE_TOLERANCE);
     if (t.thin.step > 1)
-      iterate<1, false>(t, frame, near, coarse, state, scratch);
+      iterate<1, false>(t, frame, near, coarse, false, state, scratch);
     else
-      iterate<1, true>(t, frame, near, coarse, state, scratch);
+      iterate<1, true>(t, frame, near, coarse, false, state, scratch);
     budget -= coarse;
     if (!inside(t, state.pose, frame, EDGE)) return false;
   }
-  if (set.degree == 1) iterate<1, true>(t, frame, set.tolerance, budget, state, scratch);
-  if (set.degree == 3) iterate<3, true>(t, frame, set.tolerance, budget, state, scratch);
-  if (set.degree == 5) iterate<5, true>(t, frame, set.tolerance, budget, state, scratch);
+  if (set.degree == 1) iterate<1, true>(t, frame, set.tolerance, budget, true, state, scratch);
+  if (set.degree == 3) iterate<3, true>(t, frame, set.tolerance, budget, true, state, scratch);
+  if (set.degree == 5) iterate<5, true>(t, frame, set.tolerance, budget, true, state, scratch);
   return inside(t, state.pose, frame, 0);
 }
 
