@@ -56,22 +56,24 @@ def align(
 
 
 def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
-    """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype.
-
-    Templates at the frame's border, where pixels drop out of sight, are few and take a slower way.
-    """
+    """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype."""
     templates = native.packed(reference, settings) if native.takes(image) else None
     if templates is not None:
-        estimate, left = native.solve(templates, image, pose)
+        estimate = native.solve(templates, image, pose)
     else:
         estimate = solve_in_torch(reference, image, pose, settings)
-        left = bool((on_host(estimate.status) < 0).any())
-    if not left:
+    return settle(reference, image, pose, settings, estimate)
+
+
+def settle(reference: Reference, image: Tensor, pose: Tensor, settings: Settings, estimate: Estimate) -> Estimate:
+    """``estimate`` with those templates solved that it leaves UNSETTLED, at the frame's border, where pixels drop out
+    of sight. They are few and take a slower way."""
+    left = on_host(estimate.status) == UNSETTLED
+    if not left.any():
         return estimate
-    rest = (estimate.status < 0).nonzero()[:, 0]
+    rest = torch.as_tensor(left).nonzero()[:, 0]
     part = image if len(image) == 1 else image.float()[rest]  # torch 2.4 cannot index uint16
-    settled = solve_in_torch(reference.select(rest), part, pose[rest], settings, border=True)
-    return estimate.put(rest, settled)
+    return estimate.put(rest, solve_in_torch(reference.select(rest), part, pose[rest], settings, border=True))
 
 
 def solve_in_torch(

@@ -65,25 +65,24 @@ def packed(reference: Reference, settings: Settings) -> Packed | None:
     return Packed(_pack(reference), degree, settings.max_iterations, settings.tolerance, settings.min_score)
 
 
-def solve(templates: Packed, image: Tensor, pose: Tensor) -> tuple[Estimate, int]:
-    """Estimate of B templates in (B or 1, 1, H, W) of one of DTYPES, from poses (B, 3), and how many are left out.
+def solve(templates: Packed, image: Tensor, pose: Tensor) -> Estimate:
+    """Estimate of B templates in (B or 1, 1, H, W) of one of DTYPES, from poses (B, 3); some are left out.
 
     Those have status -1: at the frame's border, where pixels drop out of sight, the torch path is needed.
     """
-    fields, left = torch.ops.torch_ecc.solve.default(image, templates.templates, pose, *templates[1:])
-    return Estimate(*fields), left
+    return Estimate(*torch.ops.torch_ecc.solve.default(image, templates.templates, pose, *templates[1:]))
 
 
 def track(
     templates: Packed, image: Tensor, state: list[Tensor], *, hold: bool, search: bool
-) -> tuple[Estimate | None, list[Tensor]]:
+) -> tuple[Estimate, list[Tensor]]:
     """One frame of a Tracker of one level: its estimate and the next ``state`` = [pose, velocity, start, score,
-    tracked, doubted]. The state is empty, the estimate that of ``solve``, if there are some to ``search`` for; None if
-    the torch path is needed: for templates at the border."""
+    tracked, doubted]. The state is empty and the estimate that of ``solve`` if there are some to ``search`` for, or
+    some left out."""
     operator = torch.ops.torch_ecc.track.default
     fields = operator(image, templates.templates, state, *templates[1:], hold, search)
     count = len(Estimate._fields)
-    return Estimate(*fields[:count]) if fields else None, fields[count:]
+    return Estimate(*fields[:count]), fields[count:]
 
 
 def _pack(reference: Reference) -> Tensor:

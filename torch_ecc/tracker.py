@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ecc import native
-from torch_ecc.align import solve
+from torch_ecc.align import settle, solve
 from torch_ecc.criteria import Criterion, centred, make_criterion
 from torch_ecc.estimate import Estimate, Status, Track
 from torch_ecc.frame import as_device, as_gray, as_image
@@ -175,18 +175,17 @@ class Tracker(nn.Module):
         return Track.stack(estimates)
 
     def _at_once(self, image: Tensor) -> tuple[Estimate | None, bool]:
-        """Prediction, solve and update in one native call, and whether that is all that this frame needs: without the
-        update if some are to be searched for, None where the native path does not serve."""
+        """Prediction, solve and update in one native call, and whether that is all that this frame needs; without the
+        update if it is not, None where the native path does not serve."""
         if self.levels > 1 or not native.takes(image):
             return None, False
-        if self._packed is None:
-            self._packed = (native.packed(self.references[0], self.settings),)
+        self._packed = self._packed or (native.packed(self.references[0], self.settings),)
         if self._packed[0] is None:
             return None, False
         state: list[Any] = [self._buffers[name] for name in STATE]  # a module's attributes are slow
         hold = self.prediction == "hold"
         estimate, state = native.track(self._packed[0], image, state, hold=hold, search=self.search)
-        self._buffers.update(zip(STATE, state, strict=False))  # none, if some are to be searched for
+        self._buffers.update(zip(STATE, state, strict=False))  # none, if this is not all
         return estimate, bool(state)
 
     @torch.no_grad()
@@ -197,6 +196,8 @@ class Tracker(nn.Module):
         start = torch.as_tensor(compose(state["pose"], state["velocity"]))
         if estimate is None:
             estimate = self._solve(images, start)
+        else:
+            estimate = settle(self.references[0], image, start, self.settings, estimate)
         strange = _strange(estimate, state["score"])
         due = self._due(strange) if self.search else []
         if due:
@@ -286,8 +287,7 @@ def _strange(estimate: Estimate, usual: Any) -> Any:
 def expected_score(reference: Reference) -> Tensor:
     """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
     _, norm = centred(reference.signal[:, 3], reference.weight)
-    power = norm.square() / reference.weight.sum(-1)
-    return (1 - reference.noise.square() / power).clamp(min=0.0)
+    return (1 - reference.noise.square() * reference.weight.sum(-1) / norm.square()).clamp(min=0.0)
 
 
 def _check_levels(levels: int, size: tuple[int, int]) -> None:

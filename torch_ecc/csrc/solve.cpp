@@ -72,15 +72,13 @@ Outcome align(const Tensor& image, const Tensor& templates, const Tensor& start,
 
 Tensor pack(at::TensorList reference, int64_t criterion) { return ecc::Packer(reference, criterion).pack(); }
 
-std::tuple<std::vector<Tensor>, int64_t> solve(const Tensor& image, const Tensor& templates, const Tensor& pose,
-                                               int64_t degree, int64_t max_iterations, double tolerance,
-                                               double min_score) {
-  const Outcome out = align(image, templates, pose, {degree, max_iterations, tolerance, min_score});
-  return {out.fields(), out.unsettled};
+std::vector<Tensor> solve(const Tensor& image, const Tensor& templates, const Tensor& pose,
+                          int64_t degree, int64_t max_iterations, double tolerance, double min_score) {
+  return align(image, templates, pose, {degree, max_iterations, tolerance, min_score}).fields();
 }
 
 // One frame of Tracker: state = [pose, velocity, start, score, tracked, doubted] -> the fields of Estimate and the next
-// state; the fields alone, as of solve, if some are to be searched for; nothing if some at the border need the torch path.
+// state; the fields alone, as of solve, if some are to be searched for or are not settled.
 std::vector<Tensor> track(const Tensor& image, const Tensor& templates, at::TensorList state, int64_t degree,
                           int64_t max_iterations, double tolerance, double min_score, bool hold, bool search) {
   const int64_t count = state[0].size(0);
@@ -102,8 +100,7 @@ std::vector<Tensor> track(const Tensor& image, const Tensor& templates, at::Tens
   };
   bool all_familiar = true;
   for (int64_t b = 0; b < count; ++b) all_familiar = all_familiar && !strange(b);
-  if (out.unsettled) return {};
-  if (search && !all_familiar) return out.fields();
+  if (out.unsettled || (search && !all_familiar)) return out.fields();
   for (int64_t b = 0; b < count; ++b) {  // Tracker._advance
     const bool good = ecc::good(status[b]);
     double *found = out.pose.data_ptr<double>() + 3 * b, *moved = out.displacement.data_ptr<double>() + 3 * b;
@@ -129,7 +126,7 @@ TORCH_LIBRARY(torch_ecc, m) {
   m.def("pack(Tensor[] reference, int criterion) -> Tensor");
   m.def(
       "solve(Tensor image, Tensor templates, Tensor pose, int degree, int max_iterations, float tolerance, "
-      "float min_score) -> (Tensor[], int)");
+      "float min_score) -> Tensor[]");
   m.def(
       "track(Tensor image, Tensor templates, Tensor[] state, int degree, int max_iterations, float tolerance, "
       "float min_score, bool hold, bool search) -> Tensor[]");
