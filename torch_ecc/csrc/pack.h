@@ -214,6 +214,7 @@ struct Packer {
         t.criterion = criterion;
         t.columns = fields[K].size(1);
         t.blocks = fields[BLOCK_SIZES].size(0);
+        t.thinned = some.size() < all.size();
         std::copy_n(fields[BOX].const_data_ptr<float>(), 8, t.box[0]);
         std::copy_n(of<float>(CENTRE, b), 2, t.centre);
         t.radius = *of<double>(RADIUS, b);

@@ -220,11 +220,12 @@ inline bool refine(const Template& t, const Frame& frame, const Settings& set, S
   scratch.patch.resize(t.whole.height * t.whole.pitch + LANES);
   scratch.lines.resize(rows_of_blocks(t.whole) * lines_of(t) * t.whole.pitch);
   scratch.rest.assign(3 * (t.whole.pitch + t.parts_pitch), 0);
+  scratch.model = scratch.change = {};
   if (!inside(t, state.pose, frame, EDGE)) return false;
-  if (budget > 1 && (set.degree > 1 || t.thin.step > 1)) {
+  if (budget > 1 && (set.degree > 1 || t.thinned)) {
     const int64_t coarse = std::max<int64_t>(budget * 2 / 3, 1);
     const double near = std::max(set.tolerance, COARSE_TOLERANCE);
-    if (t.thin.step > 1)
+    if (t.thinned)
       iterate<1, false>(t, frame, near, coarse, false, state, scratch);
     else
       iterate<1, true>(t, frame, near, coarse, false, state, scratch);

@@ -33,7 +33,7 @@ struct Pixels {  // of a template, all of them or those of every step-th row and
 };
 
 struct Template {  // the head of a block of bytes; images and weights lie behind it
-  int64_t criterion, columns, blocks, count;
+  int64_t criterion, columns, blocks, count, thinned;  // thinned: whether `thin` leaves out any pixels
   double box[2][4], centre[2], radius, noise, noise_share;
   double gram[MOST][MOST];  // R W R^T, at least as far as the column 1
   double white[3];          // square sums of K's first rows
