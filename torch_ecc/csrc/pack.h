@@ -146,10 +146,12 @@ struct Packer {
     p.soft_level = mean(z[2].data(), n);
     const float steepest = std::max(most(z[0].data(), n, 0), most(z[1].data(), n, 0));
     const auto images = [&](int64_t at) { return reinterpret_cast<int16_t*>(block + at); };
-    for (int k = 0; k < 2; ++k) round(chosen, z[k].data(), 0, steepest, images(p.z[k]));
+    float slope = 0;
+    for (int k = 0; k < 2; ++k) slope = round(chosen, z[k].data(), 0, steepest, images(p.z[k]));
     p.soft = round(chosen, z[2].data(), p.soft_level, most(z[2].data(), n, p.soft_level), images(p.z[2]));
     const auto R = columns(p, chosen, b, t);
     p.grey = p.t == 0 ? 1 : round(chosen, R[3].data(), 0, most(R[3].data(), n, 0), images(p.t));
+    const auto unit = [&](int64_t j) { return double(j < 3 ? slope : j == 4 ? 1 : p.soft); };  // of the column j of Z
     const int64_t line = lines_of(t) * p.pitch;
     std::vector<float> v(p.height * p.pitch), lines(R.size() * rows_of_blocks(p) * line);
     float* to = lines.data();
@@ -160,7 +162,7 @@ struct Packer {
         products<false>(t, p, first, std::min(BLOCK, p.height - first), v.data() + first * p.pitch, {}, to);
         add_lines(t, p, to, sums);
       }
-      for (int64_t j = 0; j < p.columns; ++j) p.inverse[j][k] = sums.z[j];
+      for (int64_t j = 0; j < p.columns; ++j) p.inverse[j][k] = sums.z[j] * unit(j);
       if (k == 3) p.of_level = sums.z;
       if (k == 4) p.of_one = sums.z;
     }
@@ -170,7 +172,9 @@ struct Packer {
       return sum;
     };
     p.contrast = std::sqrt(std::max(weighed(3, 3) - p.of_level[4] * p.of_level[4] / p.of_one[4], 0.0));
-    invert(p.inverse, p.columns);
+    invert(p.inverse, p.columns);  // in units of R on either side: what is singular does not depend on grey levels
+    for (int64_t i = 0; i < p.columns; ++i)
+      for (int64_t j = 0; j < p.columns; ++j) p.inverse[i][j] *= unit(j);
     if (p.t == 0) return;
     for (int k = 0; k < 3; ++k) std::copy_n(p.inverse[k], MOST, t.K[k]);
     for (size_t i = 0; i < R.size(); ++i)
