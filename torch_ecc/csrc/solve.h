@@ -87,7 +87,7 @@ void cover(const Template& t, const Frame& frame, const Warp& warp, Window& wind
 inline Coefficients expected(const Template& t, const Scratch& scratch, bool whole, bool anew) {
   Coefficients model{0, 0, 0, 0, scratch.patch[(whole ? t.whole : t.thin).width / 2]};
   if (whole && t.criterion == SSD) model = {0, 0, 0, 1, t.whole.level};
-  if (whole && t.criterion >= 0 && !anew && scratch.gain() > 0 && scratch.gain() < INFINITE)
+  if (whole && t.criterion != SSD && !anew && scratch.gain() > 0 && scratch.gain() < INFINITE)
     for (int k = 3; k < MOST; ++k) model[k] = scratch.model[k] + scratch.change[k];
   return model;
 }
@@ -128,10 +128,12 @@ inline void fit(const Template& t, const Pixels& p, Scratch& scratch, double (&s
     return;
   }
   double gain = 1, one = t.whole.level;  // v = t
-  if (t.criterion == PAPER) {            // v less its mean, over t less its mean; the model is a constant
-    const double w = p.of_one[4], wt = p.of_level[4];
-    gain = std::sqrt(std::max(scratch.sums.squares - sums[4] * sums[4] / w, 0.0)) / std::max(p.contrast, 1e-30);
-    one = model[4] + sums[4] / w - gain * wt / w;
+  if (t.criterion == PAPER) {            // v less its mean, over t less its mean
+    const double w = p.of_one[4], wt = p.of_level[4], mean = sums[4] / w, known = model[3] * p.contrast;
+    const double both = scratch.sums.r[3] * p.grey - mean * wt;  // what the model leaves, less its mean, times t
+    const double square = scratch.sums.squares - mean * sums[4] + 2 * model[3] * both + known * known;
+    gain = std::sqrt(std::max(square, 0.0)) / std::max(p.contrast, 1e-30);
+    one = model[4] + mean - (gain - model[3]) * wt / w;
   }
   change = {0, 0, 0, gain - model[3], one - model[4]};
   for (int k = 0; k < 3; ++k) sums[k] -= change[3] * p.of_level[k] + change[4] * p.of_one[k];
