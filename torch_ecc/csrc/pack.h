@@ -98,11 +98,16 @@ struct Packer {
     return p;
   }
 
+  // NaN, as of grey levels so large that their sums overflow, is as good as any: nothing is found with it.
+  static int16_t nearest(float value) {
+    return int16_t(std::nearbyint(std::max(-32767.f, std::min(32767.f, value))));
+  }
+
   // Values (n,) of the chosen pixels less `level` as integers; returns their unit, which `most` is the most of.
   static float round(const Grid& chosen, const float* from, float level, float most, int16_t* to) {
     const float unit = std::max(most, 1e-30f) / 32767;
     for (int64_t i = 0; i < chosen.size(); ++i)
-      to[chosen.at[i]] = int16_t(std::nearbyint(std::clamp((from[i] - level) / unit, -32767.f, 32767.f)));
+      to[chosen.at[i]] = nearest((from[i] - level) / unit);
     return unit;
   }
 
@@ -201,7 +206,7 @@ struct Packer {
         t.part[k][c] = std::max(largest, 1e-30f) / 32767;
         for (int64_t r = 0; r < count; ++r)
           for (int64_t i = row(r, k, c); i < row(r, k, c) + t.parts_pitch; ++i)
-            to[i] = int16_t(std::nearbyint(sums[i] / t.part[k][c]));
+            to[i] = nearest(sums[i] / t.part[k][c]);
       }
   }
 
