@@ -177,10 +177,9 @@ class Tracker(nn.Module):
     def _at_once(self, image: Tensor) -> tuple[Estimate | None, bool]:
         """Prediction, solve and update in one native call, and whether that is all that this frame needs; without the
         update if it is not, None where the native path does not serve."""
-        if self.levels > 1 or not native.takes(image):
-            return None, False
-        self._packed = self._packed or (native.packed(self.references[0], self.settings),)
-        if self._packed[0] is None:
+        if self._packed is None:
+            self._packed = (native.packed(self.references[0], self.settings),)
+        if self._packed[0] is None or self.levels > 1 or not native.takes(image):
             return None, False
         state: list[Any] = [self._buffers[name] for name in STATE]  # a module's attributes are slow
         hold = self.prediction == "hold"
