@@ -113,6 +113,7 @@ CALLS = {
     "align template": (lambda: align(FRAME, FRAME, POSE), "align: reference must come from prepare, got Tensor"),
     "prepare centre": (lambda: prepare(FRAME, centre=torch.zeros(3)), r"prepare: centre must be \(1, 2\), got \(3,\)"),
     "tolerance": (lambda: tracker(tolerance=0.0), "tolerance: expected a length in px > 0, got 0"),
+    "tolerance inf": (lambda: tracker(tolerance=math.inf), "tolerance: expected a length in px > 0, got inf"),
     "tolerance nan": (lambda: tracker(tolerance=math.nan), "tolerance: expected a length in px > 0, got nan"),
     "min_score": (lambda: tracker(min_score=2.0), "min_score: expected a number from 0 to 1, got 2"),
     "device": (lambda: tracker(device="abacus"), "Tracker: device must be one of this machine, got 'abacus'"),

@@ -99,16 +99,18 @@ def test_native_and_torch_agree(problem, criterion, interpolation, budget):
         for backend in ("native", "torch")
     )
     lost = [torch.where(each.status == Status.LOW_TEXTURE, Status.LOST, each.status) for each in (fast, slow)]
-    assert torch.equal(*lost)  # what has run away may end on one side of a limit or on the other
-    assert ((fast.pose - slow.pose).abs() < 1e-4).all()
+    good = Status.good(slow.status)  # either may be the one whose predicted error is just below the tolerance
+    assert torch.equal(Status.good(fast.status), good)
+    assert torch.equal(lost[0][~good], lost[1][~good])  # what has run away may end on one side of a limit or the other
+    apart = (fast.iterations - slow.iterations).abs()
+    assert (apart <= 1)[good].all()
+    assert ((fast.pose - slow.pose).abs() < torch.where(apart > 0, 2e-3, 1e-4)[:, None]).all()
     assert torch.equal(fast.displacement, fast.pose - start)
     assert torch.equal(fast.covariance.isfinite(), slow.covariance.isfinite())
-    good = Status.good(slow.status)
-    assert ((fast.iterations - slow.iterations).abs() <= 1)[good].all()
     torch.testing.assert_close(fast.score[good], slow.score[good], rtol=0, atol=1e-4)
     # What is left after a last step that is still long is known only roughly to the native path.
     for status, share in [(Status.CONVERGED, 5e-3), (Status.MAX_ITERATIONS, 0.3)]:
-        those = slow.status == status
+        those = (slow.status == status) & (fast.status == status) & (apart == 0)
         torch.testing.assert_close(fast.residual_rms[those], slow.residual_rms[those], rtol=share, atol=1e-3)
         torch.testing.assert_close(fast.sigma[those], slow.sigma[those], rtol=max(share, 1e-2), atol=0)
 

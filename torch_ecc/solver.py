@@ -47,7 +47,7 @@ class Settings:
                 raise ValueError(f"{name}: expected one of {known}, got {getattr(self, name)!r}")
         if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
             raise ValueError(f"max_iterations: expected a whole number of at least 1, got {self.max_iterations}")
-        if not self.tolerance > 0:
+        if not 0 < self.tolerance < inf:
             raise ValueError(f"tolerance: expected a length in px > 0, got {self.tolerance}")
         for name, value in (("min_score", self.min_score), ("min_visible", self.min_visible)):
             if not 0 <= value <= 1:
