@@ -243,16 +243,6 @@ def test_what_is_left_of_a_clean_image_is_told(criterion):
 
 
 @compiled
-def test_what_is_judged_has_been_seen():
-    """With any error tolerated the native path still looks once, and never judges by the patch of an earlier call."""
-    template, image, start = clean()
-    prepared = prepare(template)
-    assert align(prepared, image, start, backend="native").status == Status.CONVERGED
-    unlike = align(prepared, image.flip(-1), start, tolerance=float("inf"), backend="native")
-    assert unlike.status == Status.LOST
-
-
-@compiled
 @pytest.mark.parametrize("size", [21, 150])
 def test_packed_templates_go_with_their_reference(size):
     known, frame = set(native._packed), torch.rand(1, 1, 200, 200)

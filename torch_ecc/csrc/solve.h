@@ -202,7 +202,7 @@ void iterate(const Template& t, const Frame& frame, double tolerance, int64_t bu
   const Pixels& p = whole ? t.whole : t.thin;
   state.error = INFINITE;
   for (int64_t row = 0; row < BLOCK; ++row) fetch(t, p, row);
-  for (int64_t k = 0; k < budget && (k == 0 || state.error > tolerance || (last && vague(t, scratch))); ++k) {  // what is judged is seen
+  for (int64_t k = 0; k < budget && (state.error > tolerance || (last && vague(t, scratch))); ++k) {
     const Warp warp = warp_of(state.pose);
     cover<degree>(t, frame, warp, scratch.window, k == 0);
     look<degree, whole>(t, warp, state.iterations == 0, scratch);
