@@ -109,7 +109,7 @@ def test_native_and_torch_agree(problem, criterion, interpolation, budget):
     assert torch.equal(fast.covariance.isfinite(), slow.covariance.isfinite())
     torch.testing.assert_close(fast.score[good], slow.score[good], rtol=0, atol=1e-4)
     # What is left after a last step that is still long is known only roughly to the native path.
-    for status, share in [(Status.CONVERGED, 5e-3), (Status.MAX_ITERATIONS, 0.3)]:
+    for status, share in [(Status.CONVERGED, 5e-3), (Status.MAX_ITERATIONS, 0.6)]:
         those = (slow.status == status) & (fast.status == status) & (apart == 0)
         torch.testing.assert_close(fast.residual_rms[those], slow.residual_rms[those], rtol=share, atol=1e-3)
         torch.testing.assert_close(fast.sigma[those], slow.sigma[those], rtol=max(share, 1e-2), atol=0)

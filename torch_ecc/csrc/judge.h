@@ -72,7 +72,7 @@ inline Remains remains(const Template& t, Scratch& scratch) {
   const int64_t columns = 5 + t.light(), pitch = t.parts_pitch;
   const int16_t* part = t.at<int16_t>(t.parts);
   const float* lines = scratch.lines.data();
-  float *const line = scratch.rest.data(), *const room = line + 3 * p.pitch;
+  float *const line = scratch.rest.data(), *const room = line + 3 * (p.pitch + BLOCK);
   float taken[3][MOST];
   for (int k = 0; k < 3; ++k)
     for (int c = 0; c < MOST; ++c) taken[k][c] = float(change[c]) * t.part[k][c];

@@ -191,7 +191,7 @@ struct Packer {
   static void parts(Template& t, const float* lines, int64_t columns) {
     const Pixels& p = t.whole;
     const int64_t count = rows_of_blocks(p), each = 3 * columns * t.parts_pitch;
-    std::vector<float> sums(count * each), line(3 * p.pitch);
+    std::vector<float> sums(count * each), line(3 * (p.pitch + BLOCK));
     const auto row = [&](int64_t r, int64_t k, int64_t c) { return r * each + (k * columns + c) * t.parts_pitch; };
     for (int64_t c = 0; c < columns; ++c)
       for (int64_t r = 0; r < count; ++r, lines += lines_of(t) * p.pitch) {

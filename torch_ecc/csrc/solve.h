@@ -7,7 +7,7 @@
 namespace ecc {
 
 constexpr double COARSE_TOLERANCE = 0.02, SECANT_RANGE = 1.0, LARGEST_STRETCH = 5.0, LONGEST_STEP = 0.2;
-constexpr double CLEAR = 0.1;  // share of what is left of a patch
+constexpr double CLEAR = 0.2;  // share of what is left of a patch
 constexpr double EDGE = 4, INFINITE = HUGE_VAL;
 constexpr double MEMORY = 0.05, WORSE = 1.5, SLACK = 0.01;  // tracker.MEMORY, locate.AS_GOOD
 
@@ -187,7 +187,7 @@ inline double left_over(const Template& t, const Scratch& scratch, double& moved
     rest -= scratch.change[c] * (c < 3 ? taken : 2 * along(t, c, scratch.sums) - taken);
     if (c < 3) moved += scratch.change[c] * taken;
   }
-  return std::max(rest, 0.0);
+  return std::max(rest, CLEAR * moved);  // never nothing for certain, after a long step
 }
 
 // Whether chance may be much of what is left: in frames with next to no noise, after a step that is not small.
@@ -208,12 +208,11 @@ void iterate(const Template& t, const Frame& frame, double tolerance, int64_t bu
     look<degree, whole>(t, warp, state.iterations == 0, scratch);
     double step[3];
     fit(t, p, scratch, step);
-    if (std::isfinite(step[0]) && std::isfinite(step[1]) && std::isfinite(step[2])) {
-      advance(t, step, state);
-    } else {
+    if (!(std::isfinite(step[0]) && std::isfinite(step[1]) && std::isfinite(step[2]))) {
       state.error = 0;
       break;
     }
+    advance(t, step, state);
   }
 }
 
@@ -222,7 +221,7 @@ inline bool refine(const Template& t, const Frame& frame, const Settings& set, S
   int64_t budget = set.max_iterations;
   scratch.patch.resize(t.whole.height * t.whole.pitch + LANES);
   scratch.lines.resize(rows_of_blocks(t.whole) * lines_of(t) * t.whole.pitch);
-  scratch.rest.assign(3 * (t.whole.pitch + t.parts_pitch), 0);
+  scratch.rest.assign(3 * (t.whole.pitch + BLOCK + t.parts_pitch), 0);
   scratch.model = scratch.change = {};
   if (!inside(t, state.pose, frame, EDGE)) return false;
   if (budget > 1 && (set.degree > 1 || t.thinned)) {

@@ -181,19 +181,21 @@ inline Coefficients multiply(const Pixels& p, const Coefficients& sums) {
   return u;
 }
 
-// to[k] (blocks of a row) = sums over each block of lines (lines_of, pitch) under the rows k of K. line: (3, pitch).
+// to[k] (blocks of a row) = sums over each block of lines (lines_of, pitch) under the rows k of K. line: room for
+// (3, pitch + BLOCK), zero to begin with.
 inline void blocks(const Template& t, const float* lines, float* line, float* const (&to)[3]) {
   const Pixels& p = t.whole;
+  const int64_t each = p.pitch + BLOCK;
   for (int64_t i = 0; i < p.pitch; i += LANES) {
     Vector sum[3] = {};
     for (int64_t c = 0; c < p.columns; ++c)
       for (int k = 0; k < 3; ++k) sum[k] += t.K[k][c] * load<Vector>(lines + c * p.pitch + i);
-    for (int k = 0; k < 3; ++k) store(sum[k], line + k * p.pitch + i);
+    for (int k = 0; k < 3; ++k) store(sum[k], line + k * each + i);
   }
-  for (int k = 0; k < 3; ++k, line += p.pitch)
-    for (int64_t b = 0, i = 0; i < p.width; ++b) {
+  for (int k = 0; k < 3; ++k, line += each)
+    for (int64_t b = 0; b * BLOCK < p.width; ++b) {
       float sum = 0;
-      for (const int64_t end = std::min(i + BLOCK, p.width); i < end; ++i) sum += line[i];
+      for (int64_t l = 0; l < BLOCK; ++l) sum += line[b * BLOCK + l];
       to[k][b] = sum;
     }
 }

@@ -95,8 +95,8 @@ inline void read(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t 
 template <int degree>
 struct Prefilter {
   static constexpr int poles = degree / 2;
-  // px from where reading begins to where that is forgotten, along rows and down columns
-  static constexpr int64_t start = degree == 3 ? 15 : 18, above = degree == 3 ? 12 : 18;
+  static constexpr int64_t start = degree == 3 ? 8 : 12;  // px from where reading begins or ends to where all but 4e-5
+                                                          // of that is forgotten
 
   static double pole(int p) {
     const double inner = std::sqrt(17745.0 / 4), outer = std::sqrt(105.0 / 4);
@@ -165,13 +165,13 @@ struct Prefilter {
   }
 
   static void fill(const Frame& frame, Window& window) {
-    const int64_t high = window.h + 2 * above, pitch = padded(window.w + 2 * start);
+    const int64_t high = window.h + 2 * start, pitch = padded(window.w + 2 * start);
     window.raw.resize(pitch * high);
-    read(frame, window.x0 - start, window.y0 - above, window.w + 2 * start, high, pitch, true, window.raw.data());
+    read(frame, window.x0 - start, window.y0 - start, pitch, high, pitch, true, window.raw.data());
     columns(window.raw.data(), high, pitch);
     window.line.resize(pitch + LANES);
     for (int64_t j = 0; j < window.h; ++j) {
-      row(window.raw.data() + (above + j) * pitch, start + window.w, window.line.data());
+      row(window.raw.data() + (start + j) * pitch, start + window.w, window.line.data());
       std::copy_n(window.line.data() + start, window.w, window.values.data() + j * window.pitch());
     }
   }
