@@ -47,6 +47,7 @@ template <int degree>
 void sample_runs(const Window& window, const Line& line, float* out) {
   constexpr int taps = degree + 1;
   constexpr float unit = 1 / (UNIT[degree] * UNIT[degree]);
+  constexpr float BEYOND = 2e-5f;  // px that a run may go beyond: a line along a column of pixels would have no run
   const int64_t pitch = window.pitch(), right = window.w - taps, bottom = window.h - taps;
   const float drift = line.dx - 1, across = std::abs(line.dy);
   const float per_column = -1 / std::min(drift, -1e-9f), per_row = 1 / std::max(across, 1e-9f);
@@ -56,7 +57,7 @@ void sample_runs(const Window& window, const Line& line, float* out) {
     const float x = line.x + float(first) * line.dx, y = line.y + float(first) * line.dy;
     const int64_t ix = std::clamp<int64_t>(int64_t(x), 0, right), iy = std::clamp<int64_t>(int64_t(y), 0, bottom);
     const float fx = x - float(ix), fy = y - float(iy);
-    const float room = std::min(fx * per_column, (line.dy < 0 ? fy : 1 - fy) * per_row);
+    const float room = std::min((fx + BEYOND) * per_column, ((line.dy < 0 ? fy : 1 - fy) + BEYOND) * per_row);
     last = first + 1 + int(std::clamp(room, 0.f, float(line.n)));
     last = std::min(last, line.n);
     const float* from = window.values.data() + iy * pitch + ix;
