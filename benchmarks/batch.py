@@ -1,7 +1,7 @@
 """Many templates in one frame, beside a loop over OpenCV's ECC: python benchmarks/batch.py [--count N] [--threads N]
 
-Templates of 121 px spread over 640 x 480, inside the frame, under eq. (11) with 10 px and 2 deg, everyone starting from the
-previous pose.
+Templates of 121 px spread over 640 x 480, inside the frame, under eq. (11) with 10 px and 2 deg, everyone starting from
+the previous pose.
 """
 
 from __future__ import annotations
