@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -139,6 +140,7 @@ def centred(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return rest, (rest * rest * weight).sum(-1).sqrt()
 
 
+@np.errstate(all="ignore")
 def safe_inverse(matrix: Any) -> tuple[Any, Any]:
     """Inverse (B, n, n), zero where ``matrix`` is singular to float32, and whether it is regular, (B,) bool.
 
