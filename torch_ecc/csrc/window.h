@@ -95,8 +95,8 @@ inline void read(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t 
 template <int degree>
 struct Prefilter {
   static constexpr int poles = degree / 2;
-  static constexpr int64_t start = degree == 3 ? 8 : 12;  // px from where reading begins or ends to where all but 4e-5
-                                                          // of that is forgotten
+  // px from where reading begins or ends to where all but 4e-5 of that is forgotten
+  static constexpr int64_t start = degree == 3 ? 8 : 12;
 
   static double pole(int p) {
     const double inner = std::sqrt(17745.0 / 4), outer = std::sqrt(105.0 / 4);
