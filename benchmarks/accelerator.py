@@ -19,12 +19,14 @@ from rich.console import Console
 from scaling import SCENE, spread
 from torch import Tensor
 
-from torch_ecc import Estimate, Tracker, sampling
-from torch_ecc.align import solve_in_torch
-from torch_ecc.experiments.accuracy import Harmonic
-from torch_ecc.reference import Reference
+from torch_ecc import Estimate, Tracker
+from torch_ecc.core import sampling
+from torch_ecc.core.align import solve_in_torch
+from torch_ecc.core.reference import Reference
+from torch_ecc.core.settings import Settings
+from torch_ecc.core.solver import stages
+from torch_ecc.paper.accuracy import Harmonic
 from torch_ecc.sim import Camera, Sequence
-from torch_ecc.solver import Settings, stages
 
 FRAME = (480, 640)
 BYTES = 4 * (4 + 1)  # per pixel and iteration: float32 of the rows of K that the step needs, and of the frame

@@ -18,12 +18,12 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from torch_ecc.experiments.accuracy import Draws, Harmonic, Scatter, by_sampler, least, scatter, track_path, under_light
-from torch_ecc.sim.camera import Camera
-from torch_ecc.sim.light import GradientLight, SpotLight
-from torch_ecc.sim.pads import Pads
-from torch_ecc.sim.sequence import Sequence
-from torch_ecc.sim.waves import PlaneWaves
+from torch_ecc.paper.accuracy import Draws, Harmonic, Scatter, by_sampler, least, scatter, track_path, under_light
+from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.sim.camera.light import GradientLight, SpotLight
+from torch_ecc.sim.camera.sequence import Sequence
+from torch_ecc.sim.scene.pads import Pads
+from torch_ecc.sim.scene.waves import PlaneWaves
 
 SCENES = {"waves": PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0), "pads": Pads.wafer()}
 SAMPLERS = ("bilinear", "bspline3", "bspline5")

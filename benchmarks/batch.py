@@ -25,7 +25,7 @@ from torch import Tensor
 from trackers import options
 
 from torch_ecc import Tracker
-from torch_ecc.experiments.accuracy import SIZE, Harmonic
+from torch_ecc.paper.accuracy import SIZE, Harmonic
 from torch_ecc.sim import Camera, Sequence
 
 YARDSTICK = "OpenCV ECC, fastest fair"

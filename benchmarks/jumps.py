@@ -23,12 +23,12 @@ from torch import Tensor
 from work import WORKS, fine, waves
 
 from torch_ecc import Status, Tracker, texture
-from torch_ecc.estimate import Estimate
+from torch_ecc.core.estimate import Estimate
+from torch_ecc.core.pose import compose
 from torch_ecc.io import open_frames
-from torch_ecc.pose import compose
 from torch_ecc.sim import Camera, Pads, Scene, Speckle
-from torch_ecc.sim.still import image_scene
-from torch_ecc.tracker import PREDICTIONS
+from torch_ecc.sim.camera.still import image_scene
+from torch_ecc.track.tracker import PREDICTIONS
 
 MIDDLE = torch.tensor([320.0, 240.0, 0.0], dtype=torch.float64)
 LENGTHS, TURNS = (4.0, 8.0, 12.0, 16.0, 24.0, 40.0), (0.0, 2.0, 5.0, 10.0)  # px, deg

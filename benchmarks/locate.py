@@ -31,12 +31,12 @@ from rich.table import Table
 from torch import Tensor
 
 from torch_ecc import Locator, Status, align, prepare, texture
+from torch_ecc.core.pose import compose, inverse, to_opencv
+from torch_ecc.core.reference import Reference
 from torch_ecc.io import open_frames
-from torch_ecc.locate import halvings
-from torch_ecc.pose import compose, inverse, to_opencv
-from torch_ecc.reference import Reference
+from torch_ecc.search.locate import halvings
 from torch_ecc.sim import Camera, GradientLight, Pads, PlaneWaves, Scene, Speckle, micrograph
-from torch_ecc.sim.still import image_scene
+from torch_ecc.sim.camera.still import image_scene
 
 SIZE, SIDE = (480, 640), 121
 ALIKE = 0.25  # of the standard deviation: by less the stopping rules of two solves may part them

@@ -17,7 +17,7 @@ from rich.table import Table
 from torch import Tensor
 from work import Work
 
-from torch_ecc.experiments.style import new_figure, styled
+from torch_ecc.plots.style import new_figure, styled
 
 YARDSTICK = "OpenCV ECC, fastest fair"
 EXACT, TIMED = 0.15, 0.5  # tolerances of our errors and of our times: a shared machine is not quiet

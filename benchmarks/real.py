@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from torch_ecc import Status, Tracker
+from torch_ecc.commands.track import TrackJob, choose_templates
 from torch_ecc.io import open_frames
-from torch_ecc.session import TrackJob, choose_templates
 
 console = Console(width=120)
 

@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch_ecc.experiments.result import environment
+from torch_ecc.paper.result import environment
 
 PEERS = ("opencv-python-headless", "pystackreg", "SimpleITK")
 

@@ -25,7 +25,7 @@ from rich.table import Table
 from torch import Tensor
 
 from torch_ecc import Tracker
-from torch_ecc.experiments.accuracy import Harmonic
+from torch_ecc.paper.accuracy import Harmonic
 from torch_ecc.sim import Camera, PlaneWaves
 
 console = Console(width=110)

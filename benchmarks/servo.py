@@ -12,8 +12,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from torch_ecc.experiments.servo_trials import Trial, random_start, trial
-from torch_ecc.experiments.workcell import setting
+from torch_ecc.commands.servo_job import setting
+from torch_ecc.paper.servo_trials import Trial, random_start, trial
 from torch_ecc.servo.record import Ending
 
 NM_PER_PX = 275.0

@@ -17,8 +17,8 @@ from trackers import options
 from work import WORKS, Work
 
 import torch_ecc as te
-from torch_ecc.sampling import make_sampler
-from torch_ecc.solver import State, gauss_newton, warps
+from torch_ecc.core.sampling import make_sampler
+from torch_ecc.core.solver import State, gauss_newton, warps
 
 SAMPLERS = ("bilinear", "bspline3", "bspline5")
 BACKENDS = options()

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ecc.experiments.accuracy import SIZE, Harmonic
-from torch_ecc.experiments.bound import QUANTISATION, cramer_rao
-from torch_ecc.pose import compose
+from torch_ecc.core.pose import compose
+from torch_ecc.paper.accuracy import SIZE, Harmonic
+from torch_ecc.paper.bound import QUANTISATION, cramer_rao
 from torch_ecc.sim import Camera, GradientLight, Pads, PlaneWaves, Scene, Sequence, placed
 
 STANDARD = Harmonic(20.0, 5.0, 40).path(Camera())  # eq. (11): up to 3.1 px in x and in y, 4.4 px together, per frame

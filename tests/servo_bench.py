@@ -1,7 +1,7 @@
 """A second plant for the tests: a turntable under a camera, small and without any lag, that can be made to fail.
 
 Its rotary axis stands still in the picture and carries the axes x and y, which therefore turn with the part: another
-geometry than that of ``torch_ecc.sim.workstation``, with another Jacobian.
+geometry than that of ``torch_ecc.sim.stage.workstation``, with another Jacobian.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torch_ecc.pose import rotation
+from torch_ecc.core.pose import rotation
 from torch_ecc.servo import Limits
 from torch_ecc.sim import Camera, PlaneWaves
-from torch_ecc.tracker import Tracker
+from torch_ecc.track.tracker import Tracker
 
 SCENE = PlaneWaves.random(40, fmax=0.12, rms_gradient=4.5, seed=5)
 SIZE = (120, 160)

@@ -7,11 +7,13 @@ import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torch_ecc import align, prepare, sampling
-from torch_ecc.align import UNSETTLED, solve_in_torch
-from torch_ecc.estimate import Status
-from torch_ecc.sim.scene import PlaneWaves
-from torch_ecc.solver import Settings, State, refine
+from torch_ecc import align, prepare
+from torch_ecc.core import sampling
+from torch_ecc.core.align import UNSETTLED, solve_in_torch
+from torch_ecc.core.estimate import Status
+from torch_ecc.core.settings import Settings
+from torch_ecc.core.solver import State, refine
+from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=1)
 FRAME = (150, 170)

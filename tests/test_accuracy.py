@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from torch_ecc import Status, align, prepare
-from torch_ecc.experiments.accuracy import Draws, Harmonic, least, scatter, track_path, under_light
-from torch_ecc.experiments.bound import cramer_rao, oracle, rounding
-from torch_ecc.judge import interpolation_error
-from torch_ecc.pose import inverse, transform
-from torch_ecc.reference import ALIASING
+from torch_ecc.core.pose import inverse, transform
+from torch_ecc.core.reference import ALIASING
+from torch_ecc.core.verdict import interpolation_error
+from torch_ecc.paper.accuracy import Draws, Harmonic, least, scatter, track_path, under_light
+from torch_ecc.paper.bound import cramer_rao, oracle, rounding
 from torch_ecc.sim import Sequence
-from torch_ecc.sim.camera import Camera
-from torch_ecc.sim.light import GradientLight, SpotLight
-from torch_ecc.sim.pads import Pads
-from torch_ecc.sim.waves import PlaneWaves
+from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.sim.camera.light import GradientLight, SpotLight
+from torch_ecc.sim.scene.pads import Pads
+from torch_ecc.sim.scene.waves import PlaneWaves
 
 MASK = torch.nn.functional.pad(torch.ones(121, 121), (8, 8, 8, 8)).bool()
 SCENE = PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0)

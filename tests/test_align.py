@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torch_ecc import Status, align, prepare
-from torch_ecc.pose import compose, transform
-from torch_ecc.sim.scene import PlaneWaves
+from torch_ecc.core.pose import compose, transform
+from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=1)
 FRAME = (180, 200)

@@ -14,79 +14,67 @@ import torch_ecc
 PACKAGE = Path(torch_ecc.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-# From the bottom up; a module may import what stands before it, not what stands beside or after it.
-LAYERS = [
-    {"pose"},
-    {"frame", "sampling", "estimate", "calibration", "comparison", "config", "curves"},
-    {"criteria", "synchrony"},
-    {"noise"},
-    {"reference"},
-    {"solver", "pyramid"},
-    {"judge", "bank", "native"},
-    {"align", "patches"},
-    {"locate", "nearby"},
-    {"tracker"},
-    {"compare", "session", "servo"},
-    {"experiments"},
-    {"cli"},
-]
-LEAVES = {"io", "plots", "sim"}  # they import nothing of the package but pose
-LEAF_USERS = {"compare", "session", "servo", "experiments", "cli"}
+# From the bottom up; a package may import what stands before it, not what stands beside or after it.
+FLOORS = [{"core"}, {"search"}, {"track"}, {"servo"}, {"commands"}, {"paper"}, {"cli"}]
+# Leaves import nothing of the package but pose; what may use them, beside the floors above ``track``.
+LEAVES = {"io", "plots", "records", "config", "sim"}
+LEAF_USERS = {"commands", "paper", "cli"}
+LEAVES_BELOW = {("servo", "records"), ("sim", "config")}
+ROOMS = {"sim": ["scene", "camera", "stage"]}  # the floors of a leaf, from the bottom up
 
 
-def unit(path: Path) -> str:
-    """The module or sub-package that a file belongs to."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+def parts(path: Path) -> tuple[str, ...]:
+    """The package and the room or module in it that a file belongs to."""
+    return path.relative_to(PACKAGE).with_suffix("").parts[:2]
 
 
-def imports(path: Path) -> set[str]:
+def imports(path: Path) -> set[tuple[str, ...]]:
+    """What a file imports of torch_ecc, as the first two names below it."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level:
             pytest.fail(f"{path.name}: relative imports hide the direction")
         names = []
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names = [f"{node.module}.{a.name}" if node.module == "torch_ecc" else node.module for a in node.names]
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "torch_ecc":
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        found |= {name.split(".")[1] for name in names if name.startswith("torch_ecc.")}
+        found |= {tuple(name.split(".")[1:3]) for name in names if name.startswith("torch_ecc.")}
     return found
 
 
 def rank(name: str) -> int:
-    return next(k for k, layer in enumerate(LAYERS) if name in layer)
-
-
-def typing_only(path: Path) -> set[str]:
-    """Imports under ``if TYPE_CHECKING``: annotations may name what is above."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
-            for child in ast.walk(node):
-                if isinstance(child, ast.ImportFrom) and (child.module or "").startswith("torch_ecc."):
-                    found.add(child.module.split(".")[1])
-    return found
+    return next(k for k, floor in enumerate(FLOORS) if name in floor)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_go_one_way(path):
-    me = unit(path)
+    me, *_ = parts(path)
     if me in {"__init__", "__main__"}:
         return
-    used = imports(path) - {me} - typing_only(path)
-    if me in LEAVES:
-        assert used <= {"pose"}
-        return
-    for other in used:
+    for other, *rest in imports(path):
+        if other == me or (me in LEAVES and [other, *rest] == ["core", "pose"]):
+            continue
         if other in LEAVES:
-            assert me in LEAF_USERS, f"{me} must not import the leaf {other}"
+            assert me in LEAF_USERS or (me, other) in LEAVES_BELOW, f"{me} must not import the leaf {other}"
         else:
+            assert me not in LEAVES, f"the leaf {me} must not import {other}"
             assert rank(other) < rank(me), f"{me} must not import {other}"
 
 
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_rooms_stand_on_one_another(path):
+    me, *room = parts(path)
+    order = ROOMS.get(me, [])
+    if not room or room[0] not in order:
+        return
+    used = {rest[0] for other, *rest in imports(path) if other == me and rest}
+    assert used <= set(order[: order.index(room[0]) + 1]), f"{me}.{room[0]} must not import {used}"
+
+
 def test_every_module_has_its_place():
-    placed = set().union(*LAYERS) | LEAVES | {"__init__", "__main__"}
-    assert {unit(path) for path in FILES} <= placed
+    placed = set().union(*FLOORS) | LEAVES | {"__init__", "__main__"}
+    assert {parts(path)[0] for path in FILES} <= placed
 
 
 def test_import_is_light():

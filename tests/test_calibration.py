@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torch_ecc import Calibration, calibrate
-from torch_ecc.pose import rotation
+from torch_ecc.core.pose import rotation
 
 scales = st.floats(0.01, 10.0) | st.floats(-10.0, -0.01)
 

@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 
-from torch_ecc.comparison import Motion
-from torch_ecc.experiments import circles, fig6, fig7, fig8, fig9, fig10, fig11, parasitic, steps
-from torch_ecc.experiments.acquisition import Bench, acquire, ease, zeroed
-from torch_ecc.sim.micrograph import micrograph
-from torch_ecc.sim.microscope import Microscope
-from torch_ecc.sim.window import Window
+from torch_ecc.paper import circles, fig6, fig7, fig8, fig9, fig10, fig11, parasitic, steps
+from torch_ecc.paper.acquisition import Bench, acquire, ease, zeroed
+from torch_ecc.records.motion import Motion
+from torch_ecc.sim.scene.micrograph import micrograph
+from torch_ecc.sim.scene.window import Window
+from torch_ecc.sim.stage.microscope import Microscope
 
 MODULES = (fig6, fig7, fig8, fig9, fig10, fig11)
 

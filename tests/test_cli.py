@@ -18,8 +18,8 @@ import torch
 from click.testing import CliRunner
 
 from torch_ecc.cli import app, main
-from torch_ecc.session import Session, TrackJob
-from torch_ecc.sim.waves import PlaneWaves
+from torch_ecc.commands.track import Session, TrackJob
+from torch_ecc.sim.scene.waves import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=2)
 POSES = torch.stack(

@@ -12,10 +12,10 @@ from click.testing import CliRunner
 from PIL import Image
 
 from torch_ecc.cli import app
-from torch_ecc.compare import CompareJob, compare
-from torch_ecc.estimate import Estimate
+from torch_ecc.commands.compare import CompareJob, compare
+from torch_ecc.commands.track import STATUS_NAMES
+from torch_ecc.core.estimate import Estimate
 from torch_ecc.io import TrackWriter
-from torch_ecc.session import STATUS_NAMES
 
 SCALE, ANGLE, OFFSET = 0.25, 0.02, 0.1234  # um per px, rad, s
 NOISE_NM = 10.0

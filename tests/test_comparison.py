@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torch_ecc.comparison import Motion, check_motion, dwell_errors, nearest_errors
-from torch_ecc.curves import fit_circle, fit_ellipse, fit_line
-from torch_ecc.pose import rotation
-from torch_ecc.synchrony import Curve, Unknowns, align_records, noise, spline_slopes
+from torch_ecc.core.pose import rotation
+from torch_ecc.records.curves import fit_circle, fit_ellipse, fit_line
+from torch_ecc.records.motion import Motion, check_motion, dwell_errors, nearest_errors
+from torch_ecc.records.synchrony import Curve, Unknowns, align_records, noise, spline_slopes
 
 OFFSET, ANGLE, LEVER = 0.337, 0.01, (800.0, -500.0)
 NEAR = Unknowns(max_offset_s=0.4)

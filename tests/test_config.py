@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from torch_ecc.commands.track import TrackJob
 from torch_ecc.config import build, read_toml
-from torch_ecc.session import TrackJob
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

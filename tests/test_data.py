@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torch_ecc import Status, Tracker
-from torch_ecc.session import Session, TrackJob
+from torch_ecc.commands.track import Session, TrackJob
 
 
 def image(path) -> torch.Tensor:

@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
-from torch_ecc.experiments import fig3, fig4, robustness, scheme, table1, trials
-from torch_ecc.experiments.methods import METHODS, errors, largest
-from torch_ecc.experiments.result import counter
-from torch_ecc.pose import compose, rotation
+from torch_ecc.core.pose import compose, rotation
+from torch_ecc.paper import fig3, fig4, robustness, scheme, table1, trials
+from torch_ecc.paper.methods import METHODS, errors, largest
+from torch_ecc.paper.result import counter
 from torch_ecc.sim import Camera, PlaneWaves, Sequence
 
 

@@ -12,9 +12,9 @@ import torch
 from test_io_writing import NAMES, Report, names
 from torch import Tensor
 
+from torch_ecc.core.pose import transform
 from torch_ecc.io import OverlayWriter, open_frames
 from torch_ecc.io.shapes import outlines
-from torch_ecc.pose import transform
 
 GREY = torch.full((480, 640), 90, dtype=torch.uint8)
 

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 
 from torch_ecc import Locator, Status, Tracker, align, locate, prepare
 from torch_ecc.cli import app
-from torch_ecc.pose import compose, inverse
-from torch_ecc.session import Session, TrackJob
+from torch_ecc.commands.track import Session, TrackJob
+from torch_ecc.core.pose import compose, inverse
 from torch_ecc.sim import Camera, GradientLight, PlaneWaves, Speckle, micrograph
 
 SIZE = (200, 260)

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from torch_ecc import Locator, Status, align, prepare
-from torch_ecc.bank import details
-from torch_ecc.locate import LONGEST_WAY, both_ways, halvings
-from torch_ecc.reference import blur
+from torch_ecc.core.reference import blur
+from torch_ecc.search.bank import details
+from torch_ecc.search.locate import LONGEST_WAY, both_ways, halvings
 
 SIZE, HALF = (240, 320), 30
 

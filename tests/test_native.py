@@ -13,9 +13,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torch_ecc import ECC, SSD, PaperECC, Status, Tracker, align, native, prepare, reference
-from torch_ecc.sim.scene import PlaneWaves
-from torch_ecc.solver import Settings
+from torch_ecc import ECC, SSD, PaperECC, Status, Tracker, align, prepare
+from torch_ecc.core import native, reference
+from torch_ecc.core.settings import Settings
+from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=1)
 FRAME = (110, 130)
@@ -280,7 +281,7 @@ import sys, torch, torch_ecc as te
 frame = torch.rand(60, 60)
 print(te.Tracker(frame, [(30, 30)], 21, backend=sys.argv[1]).track(frame).pose.round().abs().tolist())
 """
-    environment = {"PATH": "", "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(Path(native.__file__).parents[1])}
+    environment = {"PATH": "", "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(Path(native.__file__).parents[2])}
     for backend, expected in (("native", "no C++ compiler"), ("auto", "")):
         command = [sys.executable, "-c", code, backend]
         run = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from torch_ecc import Status, Tracker
-from torch_ecc.criteria import make_criterion
-from torch_ecc.nearby import FARTHEST, WIDEST, Nearby
-from torch_ecc.patches import cut, locate_patches
-from torch_ecc.pose import compose
-from torch_ecc.sim.scene import Pads, PlaneWaves
-from torch_ecc.solver import Settings
-from torch_ecc.tracker import AT_ONCE, NEARBY_AT_ONCE
+from torch_ecc.core.criteria import make_criterion
+from torch_ecc.core.patches import cut, locate_patches
+from torch_ecc.core.pose import compose
+from torch_ecc.core.settings import Settings
+from torch_ecc.search.nearby import FARTHEST, WIDEST, Nearby
+from torch_ecc.sim.scene.scene import Pads, PlaneWaves
+from torch_ecc.track.tracker import AT_ONCE, NEARBY_AT_ONCE
 
 FRAME = (240, 320)
 LIGHT = make_criterion("ecc", "linear")

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torch_ecc import align, prepare
-from torch_ecc.experiments.ref34 import Ref34, jacobian, pixels
-from torch_ecc.pose import transform
-from torch_ecc.reference import MARGIN
-from torch_ecc.sampling import gradients
+from torch_ecc.core.pose import transform
+from torch_ecc.core.reference import MARGIN
+from torch_ecc.core.sampling import gradients
+from torch_ecc.paper.ref34 import Ref34, jacobian, pixels
 from torch_ecc.sim import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=1)

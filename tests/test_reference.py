@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torch_ecc import ECC, SSD, PaperECC, prepare
-from torch_ecc.criteria import safe_inverse
-from torch_ecc.pose import transform
-from torch_ecc.reference import Reference, reweigh
-from torch_ecc.sim.scene import PlaneWaves
+from torch_ecc.core.criteria import safe_inverse
+from torch_ecc.core.pose import transform
+from torch_ecc.core.reference import Reference, reweigh
+from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=3)
 CRITERIA = [ECC("gain"), ECC("linear"), ECC("quadratic"), PaperECC(), SSD()]
@@ -202,7 +202,7 @@ def test_many_templates_are_prepared_in_portions(monkeypatch, masked, some):
     templates = analytic_template(121, 131).float() + torch.randn(5, 1, 121, 131, generator=generator)
     mask = torch.rand(5, 121, 131, generator=generator) > 0.1 if masked else None
     together = prepare(templates, mask=mask)
-    monkeypatch.setattr("torch_ecc.reference.PIXELS_AT_ONCE", some * 121 * 131)
+    monkeypatch.setattr("torch_ecc.core.reference.PIXELS_AT_ONCE", some * 121 * 131)
     portions = prepare(templates, mask=mask)
     for name, whole, part in zip(Reference._fields[1:], together[1:], portions[1:], strict=True):
         torch.testing.assert_close(part, whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max()), msg=name)

@@ -13,9 +13,9 @@ from click.testing import CliRunner
 from matplotlib.figure import Figure
 
 from torch_ecc.cli import app, main
-from torch_ecc.experiments import reproduce
-from torch_ecc.experiments.report import write_report
-from torch_ecc.experiments.result import Outcome, Picture, Record, Table, load_records
+from torch_ecc.paper import reproduce
+from torch_ecc.paper.report import write_report
+from torch_ecc.paper.result import Outcome, Picture, Record, Table, load_records
 
 QUICK, FULL = ({"quick": quick, "seconds": 2.0, "cpu_seconds": 1.0} for quick in (True, False))
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -133,7 +133,7 @@ def test_run_keeps_what_was_done_and_an_interruption_loses_only_what_was_going_o
 
 def test_every_name_is_an_experiment():
     for name in reproduce.NAMES:
-        assert callable(import_module(f"torch_ecc.experiments.{name}").run)
+        assert callable(import_module(f"torch_ecc.paper.{name}").run)
 
 
 def test_names_are_put_in_order_once():

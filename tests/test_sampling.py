@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torch_ecc import sampling as S
+from torch_ecc.core import sampling as S
 
 BOX = torch.tensor([[-10.0, 10.0, 10.0, -10.0], [-8.0, -8.0, 8.0, 8.0], [1.0, 1.0, 1.0, 1.0]])
 INTERPOLATIONS = ["bilinear", "bspline3", "bspline5"]

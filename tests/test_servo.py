@@ -11,9 +11,9 @@ import torch
 from servo_bench import Turntable, jacobian
 
 import torch_ecc
-from torch_ecc.experiments.servo_trials import random_start, single, trial
-from torch_ecc.experiments.workcell import setting
-from torch_ecc.pose import rotation
+from torch_ecc.commands.servo_job import setting
+from torch_ecc.core.pose import rotation
+from torch_ecc.paper.servo_trials import random_start, single, trial
 from torch_ecc.servo import Control, Ending, decay_rate, find, servo
 
 README = Path(__file__).parents[1] / "README.md"

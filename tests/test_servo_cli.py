@@ -13,10 +13,11 @@ import pytest
 from click.testing import CliRunner
 
 from torch_ecc.cli import app
-from torch_ecc.experiments import fig12, fig13, servo_session
-from torch_ecc.experiments.servo_session import LogWriter
-from torch_ecc.experiments.servo_trials import single
-from torch_ecc.experiments.workcell import ServoJob, setting
+from torch_ecc.commands import servo as servo_session
+from torch_ecc.commands.servo import LogWriter
+from torch_ecc.commands.servo_job import ServoJob, setting
+from torch_ecc.paper import fig12, fig13
+from torch_ecc.paper.servo_trials import single
 from torch_ecc.servo import Step
 
 CONFIG = Path(__file__).parents[1] / "configs" / "servo.toml"

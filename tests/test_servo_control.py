@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torch_ecc.calibration import Calibration
+from torch_ecc.records.calibration import Calibration
 from torch_ecc.servo import Control, Controller, StageJacobian, decay_rate
 from torch_ecc.servo.jacobian import condition, learn, planned_move, pseudo_inverse
 

@@ -23,9 +23,9 @@ from torch_ecc.sim import (
     noise_sigma,
     placed,
 )
-from torch_ecc.sim.layout import Rectangle
-from torch_ecc.sim.optics import disc
-from torch_ecc.sim.sensor import generator
+from torch_ecc.sim.camera.optics import disc
+from torch_ecc.sim.camera.sensor import generator
+from torch_ecc.sim.scene.layout import Rectangle
 
 SIZE = (60, 81)
 SCENE = PlaneWaves.random(60, seed=2)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ecc.pose import inverse, transform
+from torch_ecc.core.pose import inverse, transform
 from torch_ecc.sim import ImageScene, Pads, PlaneWaves, multi_scale, single_scale
-from torch_ecc.sim.still import image_light, image_scene, read_still
+from torch_ecc.sim.camera.still import image_light, image_scene, read_still
 
 ANALYTIC = {
     "waves": PlaneWaves.random(seed=3),

@@ -7,8 +7,8 @@ from math import asin, hypot, radians, tan, tau
 import pytest
 import torch
 
-from torch_ecc.calibration import Calibration, calibrate
-from torch_ecc.pose import transform
+from torch_ecc.core.pose import transform
+from torch_ecc.records.calibration import Calibration, calibrate
 from torch_ecc.sim import Floor, Microscope, PlaneWaves, Sensors, SensorSettings, Stage, StageSettings
 
 STILL = Floor(speed_um_s=0.0)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_ecc.sim import circle, from_rest, harmonic, placed, ramp, random_walk, steps, table
-from torch_ecc.sim.motion import velocity
+from torch_ecc.sim.camera.motion import velocity
 
 
 def test_harmonic_is_equation_11():

@@ -7,9 +7,9 @@ from math import pi, sqrt
 import pytest
 import torch
 
-from torch_ecc.pose import compose, inverse, transform
+from torch_ecc.core.pose import compose, inverse, transform
 from torch_ecc.sim import Pads, PlaneWaves, Speckle, Sum, micrograph
-from torch_ecc.sim.layout import Rectangle
+from torch_ecc.sim.scene.layout import Rectangle
 
 SIZE = (90, 120)
 SMALL = Pads.of([Rectangle(3, -5, 40, 22, 60, 0.3), Rectangle(-20, 10, 3, 30, -40)], sigma=1.2, base=90)

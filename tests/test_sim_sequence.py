@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from torch_ecc.pose import inverse, transform
+from torch_ecc.core.pose import inverse, transform
 from torch_ecc.sim import (
     Camera,
     PlaneWaves,
@@ -28,7 +28,7 @@ from torch_ecc.sim import (
     placed,
     save,
 )
-from torch_ecc.sim.dataset import read_poses
+from torch_ecc.sim.camera.dataset import read_poses
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SIZE = (64, 80)

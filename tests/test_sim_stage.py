@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torch_ecc.pose import transform
+from torch_ecc.core.pose import transform
 from torch_ecc.sim import Floor, Hysteresis, Stage, StageSettings, Vibration
-from torch_ecc.sim.hysteresis import play
-from torch_ecc.sim.plant import Plant, phi1, phi2, recur
+from torch_ecc.sim.stage.hysteresis import play
+from torch_ecc.sim.stage.plant import Plant, phi1, phi2, recur
 
 IDEAL = {
     "hysteresis": Hysteresis(share=0.0),

@@ -9,13 +9,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torch_ecc.calibration import Calibration
-from torch_ecc.pose import compose, inverse, transform
+from torch_ecc.core.pose import compose, inverse, transform
+from torch_ecc.records.calibration import Calibration
 from torch_ecc.servo import StageJacobian
 from torch_ecc.sim import Camera, PlaneWaves
-from torch_ecc.sim.axes import Axis, MultiAxisStage
-from torch_ecc.sim.probe import Probe
-from torch_ecc.sim.workstation import Microscope, Mount, Workstation
+from torch_ecc.sim.scene.probe import Probe
+from torch_ecc.sim.stage.axes import Axis, MultiAxisStage
+from torch_ecc.sim.stage.workstation import Microscope, Mount, Workstation
 
 SCENE = PlaneWaves.random(30, seed=3)
 FREE = {"step": 0.0, "speed": 1e3}

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from torch_ecc import SequenceError, Status, Tracker, texture
-from torch_ecc.sim.scene import PlaneWaves
+from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=5)
 FRAME = (200, 240)
@@ -31,7 +31,7 @@ def frames(path: torch.Tensor) -> torch.Tensor:
 
 def rigid(path: torch.Tensor, centers=CENTERS) -> torch.Tensor:
     """Where the points that were at ``centers`` in the first frame are: (F, R, 3)."""
-    from torch_ecc.pose import compose, inverse
+    from torch_ecc.core.pose import compose, inverse
 
     start = torch.cat((torch.tensor(centers), torch.zeros(len(centers), 1)), 1).double()
     local = compose(inverse(path[:1]), start)
@@ -231,7 +231,7 @@ def test_the_accelerator_path_gives_the_same_on_a_cpu(monkeypatch):
     """Never looking at a value, as on an accelerator, changes nothing but the cost."""
     stack = frames(PATH)
     looking = Tracker(stack[0], CENTERS, 51, backend="torch").track_sequence(stack[1:8])
-    monkeypatch.setattr("torch_ecc.sampling.LOOKED_AT", set())
+    monkeypatch.setattr("torch_ecc.core.sampling.LOOKED_AT", set())
     blind = Tracker(stack[0], CENTERS, 51, backend="torch").track_sequence(stack[1:8])
     assert (looking.pose - blind.pose).abs().max() < 1e-4
     assert torch.equal(looking.status, blind.status)

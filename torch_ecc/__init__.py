@@ -5,15 +5,15 @@ finds a patch anywhere, at any angle; ``texture`` judges it beforehand; ``Calibr
 Conventions: see ``torch_ecc.pose``.
 """
 
-from torch_ecc import pose
-from torch_ecc.align import align
-from torch_ecc.calibration import Calibration, CalibrationFit, calibrate
-from torch_ecc.criteria import ECC, SSD, Criterion, PaperECC
-from torch_ecc.estimate import Estimate, Status, Track
-from torch_ecc.locate import Located, Locator, locate
-from torch_ecc.patches import texture
-from torch_ecc.reference import Reference, prepare
-from torch_ecc.tracker import SequenceError, Tracker
+from torch_ecc.core import pose
+from torch_ecc.core.align import align
+from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
+from torch_ecc.core.estimate import Estimate, Status, Track
+from torch_ecc.core.patches import texture
+from torch_ecc.core.reference import Reference, prepare
+from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
+from torch_ecc.search.locate import Located, Locator, locate
+from torch_ecc.track.tracker import SequenceError, Tracker
 
 __version__ = "0.1.0"
 

@@ -32,7 +32,7 @@ def app() -> None:
 @click.option("--frames", default=120, show_default=True, type=click.IntRange(8), help="Frames of one cycle of motion.")
 def demo(out: str, frames: int) -> None:
     """Make a microscope-like sequence with known motion, track it with ECC and SSD, print the errors."""
-    from torch_ecc.experiments.demo import run_demo
+    from torch_ecc.commands.demo import run_demo
 
     with progress_bar("demo") as advance:
         result = run_demo(Path(out), frames, advance)
@@ -72,7 +72,7 @@ def track(config: str | None, size: str | None, polygons: tuple[str, ...], **opt
     INPUT is a video, a folder or glob of images, a multi-page TIFF, an .npy or .npz stack or a camera index. Repeat
     --center (or --polygon, or --template) for more templates.
     """
-    from torch_ecc.session import Session, TrackJob
+    from torch_ecc.commands.track import Session, TrackJob
 
     if size is not None:
         options["size"] = _size(size)
@@ -118,7 +118,7 @@ def reproduce(names: tuple[str, ...], quick: bool, out: str) -> None:
 
     NAME is fig2, fig3, fig4, table1, ... or all. DIR/report.html collects everything that was reproduced in DIR.
     """
-    from torch_ecc.experiments.reproduce import chosen, run
+    from torch_ecc.paper.reproduce import chosen, run
 
     try:
         for name in chosen(names):
@@ -165,7 +165,7 @@ def compare(**options: Any) -> None:
 
     SENSORS is a CSV file with the columns time_s, x_um, y_um and theta_urad, theta_deg or theta_rad.
     """
-    from torch_ecc import compare as job_of
+    from torch_ecc.commands import compare as job_of
 
     job = build(job_of.CompareJob, {name: value for name, value in options.items() if value is not None}, "compare")
     figures = job_of.write(job, job_of.compare(job))
@@ -182,8 +182,8 @@ def servo(config: str, **options: Any) -> None:
 
     CONFIG is a TOML file such as configs/servo.toml. Exit status 0 only if the probe is where it should be.
     """
-    from torch_ecc.experiments.servo_session import describe, run_session
-    from torch_ecc.experiments.workcell import ServoJob
+    from torch_ecc.commands.servo import describe, run_session
+    from torch_ecc.commands.servo_job import ServoJob
 
     values = read_toml(config)
     given = {name: value for name, value in options.items() if value is not None}
@@ -216,7 +216,7 @@ def _polygon(text: str) -> list[list[float]]:
 
 def _report(outcome: Any) -> None:
     """Say in words what became of a run."""
-    from torch_ecc.estimate import Status
+    from torch_ecc.core.estimate import Status
 
     for number, lost in enumerate(outcome.lost.tolist()):
         if lost:

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_ecc.core.pose import transform
 from torch_ecc.io.canvas import Box, Canvas, Colour
 from torch_ecc.io.records import CONVERGED, DOUBTFUL
-from torch_ecc.pose import transform
 
 _COLOURS: dict[str, Colour] = {CONVERGED: (90, 225, 70), DOUBTFUL: (0, 165, 255)}
 _LOST: Colour = (70, 70, 255)

@@ -13,15 +13,15 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from torch_ecc.estimate import Estimate
-from torch_ecc.pose import transform
+from torch_ecc.core.estimate import Estimate
+from torch_ecc.core.pose import transform
 from torch_ecc.servo.control import Control
 from torch_ecc.servo.detect import find
 from torch_ecc.servo.jacobian import Jacobian
 from torch_ecc.servo.loop import Observer, servo
 from torch_ecc.servo.plant import Plant
 from torch_ecc.servo.record import Ending, Result, Step
-from torch_ecc.tracker import Tracker
+from torch_ecc.track.tracker import Tracker
 
 Point: TypeAlias = tuple[float, float]
 Detect: TypeAlias = Callable[[Tracker, Tensor], None]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_ecc.estimate import Status
-from torch_ecc.locate import locate
-from torch_ecc.pose import unwrap
-from torch_ecc.tracker import Tracker
+from torch_ecc.core.estimate import Status
+from torch_ecc.core.pose import unwrap
+from torch_ecc.search.locate import locate
+from torch_ecc.track.tracker import Tracker
 
 
 def find(tracker: Tracker, frame: Tensor) -> None:

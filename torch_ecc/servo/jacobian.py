@@ -29,8 +29,8 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from torch_ecc.calibration import Calibration
-from torch_ecc.pose import rotation
+from torch_ecc.core.pose import rotation
+from torch_ecc.records.calibration import Calibration
 
 Jacobian: TypeAlias = Callable[[Tensor], Tensor]
 """Pose (3,) -> (3, n), px and rad per um and rad of the n axes."""

@@ -9,15 +9,15 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from torch_ecc.estimate import Estimate, Status
-from torch_ecc.pose import transform, unwrap
+from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.pose import transform, unwrap
 from torch_ecc.servo.control import Control, Controller
 from torch_ecc.servo.detect import find
 from torch_ecc.servo.jacobian import Jacobian, planned_move, pseudo_inverse
 from torch_ecc.servo.plant import Plant, read_limits
 from torch_ecc.servo.record import Ending, Log, Result, Step
 from torch_ecc.servo.watch import Watch
-from torch_ecc.tracker import Tracker
+from torch_ecc.track.tracker import Tracker
 
 Observer: TypeAlias = Callable[[Tensor, Estimate, Step], None]
 SEARCH_EVERY = 5  # frames without the target from one search to the next

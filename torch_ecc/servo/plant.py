@@ -1,4 +1,4 @@
-"""What a stage and its camera must offer to be servoed; a simulated one is ``torch_ecc.sim.workstation.Drive``."""
+"""What a stage and its camera must offer to be servoed; a simulated one is ``sim.stage.workstation.Drive``."""
 
 from __future__ import annotations
 

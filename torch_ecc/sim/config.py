@@ -13,16 +13,16 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_ecc.sim import motion
-from torch_ecc.sim.camera import Camera
-from torch_ecc.sim.dataset import read_poses
-from torch_ecc.sim.light import GradientLight, LampDrift, Light, Lights, SpotLight, VignetteLight
-from torch_ecc.sim.micrograph import micrograph
-from torch_ecc.sim.scene import Pads, PlaneWaves, Scene, Speckle
-from torch_ecc.sim.sensor import noise_sigma
-from torch_ecc.sim.sequence import Sequence, check_inside
+from torch_ecc.sim.camera import motion
+from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.sim.camera.dataset import read_poses
+from torch_ecc.sim.camera.light import GradientLight, LampDrift, Light, Lights, SpotLight, VignetteLight
+from torch_ecc.sim.camera.sensor import noise_sigma
+from torch_ecc.sim.camera.sequence import Sequence, check_inside
+from torch_ecc.sim.camera.still import image_light, image_scene
+from torch_ecc.sim.scene.micrograph import micrograph
+from torch_ecc.sim.scene.scene import Pads, PlaneWaves, Scene, Speckle
 from torch_ecc.sim.settings import choose, fill
-from torch_ecc.sim.still import image_light, image_scene
 
 SCENES: dict[str, Callable[..., Scene]] = {
     "micrograph": micrograph,

@@ -1,0 +1,175 @@
+"""Matching criteria: which columns explain a sampled patch, and the Gauss-Newton step that follows.
+
+A template of N pixels is a vector t with steepest-descent images G (3 x N: its gradient times eq. 8 at theta = 0). A
+criterion names the columns R that a sampled patch g is fitted with; ``reference.prepare`` turns them into one constant
+matrix K, and the step is a simple function of K g.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_ecc.core.pose import alike, library
+
+if TYPE_CHECKING:
+    from torch_ecc.core.reference import Reference
+
+ILLUMINATION = {"gain": 0, "linear": 2, "quadratic": 5}  # columns beside t itself
+
+
+class Fit(NamedTuple):
+    """What a criterion's model leaves of sampled patches: ``residual`` (B, N) and the patch's ``gain`` (B,)."""
+
+    residual: Tensor
+    gain: Tensor
+
+
+class Criterion(Protocol):
+    """What the solver asks of a matching criterion; B templates, N pixels, p columns of which the first 3 are G."""
+
+    def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
+        """R (B, p, N) from ``signal`` = [G, t] (B, 4, N) and pixel positions ``uv`` (B, 2, N) scaled to [-1, 1]."""
+        ...
+
+    def step(self, reference: Reference, g: Tensor) -> Tensor:
+        """The increment (B, 3) that the sampled patches ``g`` (B, N) ask for; non-finite if they ask for none."""
+        ...
+
+    def fit(self, reference: Reference, g: Tensor) -> Fit:
+        """Residual and gain of the sampled patches ``g`` (B, N) under the criterion's model."""
+        ...
+
+
+@dataclass(frozen=True)
+class ECC:
+    """Enhanced correlation coefficient (eq. 4) with the exact step of its linearised form.
+
+    g = a t + b^T G + c 1 (+ light columns) is fitted and the increment is b / a: the step of Evangelidis and Psarakis
+    with the roles of template and image exchanged. ``illumination``: "gain" is the paper's ECC (one gain, one offset);
+    "linear" lets the gain vary linearly over the template (columns t x', t y'), "quadratic" adds their squares and
+    product. More columns cost no time per iteration and some variance on weak templates.
+    """
+
+    illumination: str = "linear"
+
+    def __post_init__(self) -> None:
+        if self.illumination not in ILLUMINATION:
+            raise ValueError(f"illumination: expected one of {list(ILLUMINATION)}, got {self.illumination!r}")
+
+    def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
+        """[G, t, 1, t u, t v, t u^2, t v^2, t u v], as many as ``illumination`` asks for: (B, 5 + 0 | 2 | 5, N).
+
+        t stands without its mean, which the column 1 makes up for: on a high pedestal the two would look alike.
+        """
+        t = signal[:, 3:]
+        contrast = t - t.mean(-1, keepdim=True)
+        return torch.cat((signal[:, :3], contrast, torch.ones_like(t), t * self.light(uv)), 1)
+
+    def light(self, uv: Tensor) -> Tensor:
+        """What the gain may vary by over the template: u, v, u^2, v^2, u v, (B, 0 | 2 | 5, N)."""
+        if self.illumination != "quadratic":
+            return uv[:, : ILLUMINATION[self.illumination]]
+        return torch.cat((uv, uv * uv, uv[:, :1] * uv[:, 1:]), 1)
+
+    def step(self, reference: Reference, g: Tensor) -> Tensor:
+        """b / a, (B, 3); infinite or NaN where the gain a is not positive."""
+        g = g - g.narrow(1, 0, 1)  # K does not see a constant, but its sums stay small
+        u = torch.bmm(reference.K.narrow(1, 0, 4), g.unsqueeze(2)).squeeze(2)
+        increment, gain = torch.split_with_sizes(u, (3, 1), 1)
+        return increment / gain.relu()
+
+    def fit(self, reference: Reference, g: Tensor) -> Fit:
+        """g minus all columns; the gain is the coefficient a of t."""
+        t, g = reference.signal.select(1, 3), g - g.narrow(1, 0, 1)
+        u = torch.bmm(g.unsqueeze(1), reference.K.mT)
+        slopes, gain = u.narrow(2, 0, 4), u[:, 0, 3:4]
+        rest = torch.baddbmm(g.unsqueeze(1), slopes, reference.signal, alpha=-1).squeeze(1)
+        if self.illumination != "gain":
+            light = torch.bmm(u.narrow(2, 5, u.shape[2] - 5), self.light(reference.uv)).squeeze(1)
+            rest.addcmul_(light, t, value=-1)
+        return Fit(rest.sub_(u[:, 0, 4:5] - gain * (t.sum(-1, keepdim=True) / t.shape[1])), gain[:, 0])
+
+
+@dataclass(frozen=True)
+class PaperECC:
+    """Eq. (9) to the letter: J not projected off the template and the constant, light as one gain and one offset."""
+
+    def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
+        """J, (B, 3, N)."""
+        return signal[:, :3]
+
+    def step(self, reference: Reference, g: Tensor) -> Tensor:
+        """(J^T J)^-1 J^T [ (dh / dg) (g - mean g) - (h - mean h) ], (B, 3): the sign of J's own increment."""
+        residual, gain = self.fit(reference, g)
+        return (reference.K @ residual[:, :, None])[:, :, 0] / gain[:, None]
+
+    def fit(self, reference: Reference, g: Tensor) -> Fit:
+        """(g - mean g) - (dg / dh) (h - mean h), and dg / dh."""
+        h0, dh = centred(reference.signal[:, 3], reference.weight)
+        g0, dg = centred(g, reference.weight)
+        gain = dg / dh.clamp(min=1e-30)
+        return Fit(g0 - gain[:, None] * h0, gain)
+
+
+@dataclass(frozen=True)
+class SSD:
+    """Sum of squared differences, the baseline: no gain and no offset."""
+
+    def columns(self, signal: Tensor, uv: Tensor) -> Tensor:
+        """G, (B, 3, N)."""
+        return signal[:, :3]
+
+    def step(self, reference: Reference, g: Tensor) -> Tensor:
+        """pinv(G) (g - t), (B, 3)."""
+        return (reference.K @ (g - reference.signal[:, 3])[:, :, None])[:, :, 0]
+
+    def fit(self, reference: Reference, g: Tensor) -> Fit:
+        """g - t; the gain is 1."""
+        return Fit(g - reference.signal[:, 3], torch.ones_like(g[:, 0]))
+
+
+def centred(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """``values`` (B, N) minus their weighted mean, and the weighted norm (B,) of the rest."""
+    mean = (values * weight).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-30)
+    rest = values - mean
+    return rest, (rest * rest * weight).sum(-1).sqrt()
+
+
+@np.errstate(all="ignore")
+def safe_inverse(matrix: Any) -> tuple[Any, Any]:
+    """Inverse (B, n, n), zero where ``matrix`` is singular to float32, and whether it is regular, (B,) bool.
+
+    Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude. Tensors or
+    numpy arrays.
+    """
+    xp = library(matrix)
+    diagonal = xp.diagonal(matrix, 0, -2, -1)
+    scale = abs(diagonal).clip(1e-30) ** -0.5
+    scale = scale[:, :, None] * scale[:, None, :]
+    unit = matrix * scale
+    if unit.shape[-1] == 3:  # the adjugate, where LAPACK would take longer to begin
+        twice = xp.concatenate((unit, unit), 1)
+        twice = xp.concatenate((twice, twice), 2)
+        minors = twice[:, 1:4, 1:4] * twice[:, 2:5, 2:5] - twice[:, 1:4, 2:5] * twice[:, 2:5, 1:4]
+        inverse = xp.swapaxes(minors, 1, 2) / (unit[:, :1] * minors[:, :1]).sum(-1)[:, :, None]
+    else:
+        inverse = alike(torch.linalg.inv_ex(torch.as_tensor(unit))[0], matrix)
+    regular = (abs(inverse).sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
+    return xp.where(regular[:, None, None], inverse * scale, 0.0), regular
+
+
+def make_criterion(criterion: str | Criterion, illumination: str = "linear") -> Criterion:
+    """The criterion of a name ("ecc", "ecc_paper" or "ssd"), or the object itself."""
+    if not isinstance(criterion, str):
+        if isinstance(criterion, type) or not all(hasattr(criterion, name) for name in ("columns", "step", "fit")):
+            raise ValueError(f"criterion: expected a name or an object with columns, step and fit, got {criterion!r}")
+        return criterion
+    known: dict[str, Criterion] = {"ecc": ECC(illumination), "ecc_paper": PaperECC(), "ssd": SSD()}
+    if criterion not in known:
+        raise ValueError(f"criterion: expected one of {list(known)} or an object, got {criterion!r}")
+    return known[criterion]

@@ -1,0 +1,64 @@
+"""The noise of a template: how much there is, and what it adds to sums over the template's gradients."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.criteria import centred, safe_inverse
+from torch_ecc.core.sampling import blur, gradients, noise_level
+
+INSTRUMENT_BLUR = 0.9  # px; 0.7 to 1 serve alike
+NEARBY = 4.0  # px: Gaussian window in which the texture of a template is told from its noise
+CERTAIN = 1.3  # times the noise's power in that window: by chance alone it is not more
+LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
+
+
+def template_noise(gray: Tensor, kept: Tensor) -> Tensor:
+    """Upper estimate (B,) of the noise of templates (B, 1, h, w), grey levels, where ``kept`` > 0."""
+    weight = kept.flatten(1)
+    contrast = centred(gray.flatten(1), weight)[1] / weight.sum(-1).sqrt()
+    return torch.maximum(noise_level(gray, kept), LEAST_NOISE * contrast)
+
+
+def texture_share(gradient: Tensor, noise: Tensor) -> Tensor:
+    """How much of the blurred ``gradient`` (B, 2, h, w) is texture, not ``noise`` (B,), near each pixel: (B, 1, h, w).
+
+    The factor S / (S + N / 2) that makes the scatter of two equally noisy images least, from the gradient's power
+    nearby. Where a template is flat its gradient is all noise, which as an instrument would only add scatter.
+    """
+    floor = 2 * noise_response()[1] * noise.to(gradient.dtype).square()[:, None, None, None]
+    power = (blur(gradient.square().sum(1, keepdim=True), NEARBY) - CERTAIN * floor).clamp(min=0)
+    return power / (power + floor / 2).clamp(min=1e-30)
+
+
+@lru_cache(maxsize=1)
+def noise_response() -> tuple[float, float]:
+    """Of the x derivative of white noise of unit variance: raw times blurred, and blurred squared, on average."""
+    impulse = torch.zeros(1, 1, 33, 33)
+    impulse[..., 16, 16] = 1.0
+    raw, blurred = gradients(impulse)[:, 0], gradients(blur(impulse, INSTRUMENT_BLUR))[:, 0]
+    return float((raw * blurred).sum()), float((blurred * blurred).sum())
+
+
+def noise_slope(local: Tensor, weight: Tensor) -> Tensor:
+    """Sum over pixels ``local`` (B, 2, N) of w (dW/dp)^T dW/dp, (B, 3, 3): Z W G^T's shape if gradients are noise."""
+    x, y = local.unbind(1)
+    moments = (weight.expand_as(x), weight * x, weight * y, weight * (x * x + y * y))
+    n, wx, wy, wr = (moment.sum(-1) for moment in moments)
+    zero = torch.zeros_like(n)
+    return torch.stack((n, zero, wy, zero, n, -wx, wy, -wx, wr), -1).reshape(-1, 3, 3)
+
+
+def largest_share(slope: Tensor, inflation: Tensor) -> Tensor:
+    """Largest eigenvalue of slope^-1 inflation, (B,), infinite where the slope is singular.
+
+    By a high power of the matrix, to 7 % from above, which an eigenvalue solver would not do without synchronising.
+    """
+    inverse, regular = safe_inverse(slope)
+    share = inverse @ inflation
+    scale = share.abs().amax((-2, -1), keepdim=True).clamp(min=1e-30)
+    power = torch.linalg.matrix_power(share / scale, 16).diagonal(dim1=-2, dim2=-1).sum(-1)
+    return torch.where(regular & (power > 0), power.clamp(min=0) ** (1 / 16) * scale[:, 0, 0], torch.inf)

@@ -1,0 +1,156 @@
+"""The experimental system of Fig. 5 and Table II, simulated: a stage, its capacitive sensors, and a microscope's camera
+whose rendered frames are tracked. Both records come with clocks of their own, as untriggered instruments give them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.estimate import Estimate, Status, Track
+from torch_ecc.records.calibration import Calibration
+from torch_ecc.records.motion import Motion
+from torch_ecc.sim.camera.light import Light
+from torch_ecc.sim.camera.sequence import Sequence
+from torch_ecc.sim.scene.micrograph import micrograph
+from torch_ecc.sim.scene.window import Window
+from torch_ecc.sim.stage.microscope import Microscope
+from torch_ecc.sim.stage.sensors import Sensors
+from torch_ecc.sim.stage.stage import Stage, StageMotion, StageSettings
+from torch_ecc.sim.stage.vibration import Floor
+from torch_ecc.track.tracker import Tracker
+
+SIZE = 121  # px, the paper's template
+AROUND = 16  # px drawn around it: all that a tracker reads
+COMMAND_HZ = 1000.0
+QUIET = Floor(speed_um_s=0.78)  # VC-G: an isolated table (Amick et al., SPIE 5933, 2005)
+# Of the microscope: a stiff column on that table, and a strobe (2 ms of light would smear 0.05 um at most).
+ON_TABLE: Mapping[str, Any] = {"floor": QUIET, "column_hz": 90.0, "exposure_s": 0.0}
+CAMERA_START_S = 0.2137  # of the stage's clock; the sensors start with the stage
+METHODS: Mapping[str, Mapping[str, Any]] = {"ECC": {}}
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Settings: microscope, light, ``gain`` and ``noise`` of the camera in grey levels, and the trackers by name."""
+
+    microscope: Microscope = field(default_factory=lambda: Microscope(**ON_TABLE))
+    light: Light | None = None
+    gain: float = 1.0
+    noise: float = 2.0
+    methods: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: METHODS)
+    seed: int = 0
+
+
+class Acquisition(NamedTuple):
+    """Both records as ``Motion`` in um, um, rad: one per tracker, NaN where it was lost, and the sensors'.
+
+    Each counts from its own zero; ``zeroed`` brings them to zero at rest. ``sigma`` (F, 3) um, um, rad as each tracker
+    gives it; ``truth`` is what the template's image really did, through the same calibration, ``motion`` what the stage
+    really did, on the sensors' clock, and ``offset_s`` the truth of the clocks. ``seconds`` each part took; ``first``
+    (H, W) is the first frame.
+    """
+
+    tracks: dict[str, Motion]
+    sigma: dict[str, Tensor]
+    sensors: Motion
+    truth: Motion
+    motion: StageMotion
+    offset_s: float
+    seconds: dict[str, float]
+    first: Tensor
+
+
+def acquire(command: Tensor, bench: Bench, tick: Callable[[], None]) -> Acquisition:
+    """Run the stage along ``command`` (T, 3) um, um, rad at 1 kHz, film it at 100 Hz and read the sensors at 1024 Hz.
+
+    The trackers' scale is known, the angle between image and stage is not. ``tick`` is called at every frame.
+    """
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "stage"):
+        motion = Stage(StageSettings(floor=QUIET), seed=bench.seed).run(command, COMMAND_HZ)
+    with _timed(seconds, "sensors"):
+        sensors = Sensors(seed=bench.seed)
+        record = sensors.record(motion)
+        pose = sensors.settings.mounting.pose(record.distance_um)
+        read = Motion(record.times_s, torch.where(record.saturated.any(-1, keepdim=True), torch.nan, pose))
+    film = _film(motion, bench)
+    tracks, first = _track(film, bench, seconds, tick)
+    scale = Calibration(bench.microscope.um_per_px)
+    times = torch.arange(len(film), dtype=torch.float64) / bench.microscope.frame_rate_hz
+    center = torch.tensor([_middle(film.camera.size)])
+    truth = scale.to_physical(film.truth(center)[:, 0] - film.truth(center)[0, 0])
+    offset = float(bench.microscope.times(motion, start_s=CAMERA_START_S)[0] - record.times_s[0])
+    motions, sigma = {}, {}
+    for name, track in tracks.items():
+        pose = scale.to_physical(track.displacement[:, 0])
+        motions[name] = Motion(times, torch.where(Status.good(track.status), pose, torch.nan))
+        sigma[name] = scale.covariance(track.covariance[:, 0]).diagonal(dim1=-2, dim2=-1).sqrt()
+    return Acquisition(motions, sigma, read, Motion(times, truth), motion, offset, seconds, first)
+
+
+def tracker_of(first: Tensor, **options: Any) -> Tracker:
+    """The tracker of the template in the middle of the first frame (H, W)."""
+    return Tracker(first, [_middle((first.shape[-2], first.shape[-1]))], SIZE, **options)
+
+
+def zeroed(motion: Motion, rest_s: float) -> Motion:
+    """The record from the mean of its first ``rest_s`` s, in which the stage rests."""
+    rest = motion.pose[motion.time_s < motion.time_s[0] + rest_s]
+    return Motion(motion.time_s, motion.pose - rest[rest.isfinite().all(1)].mean(0))
+
+
+def frames_of(command: Tensor, bench: Bench) -> int:
+    """Frames that ``acquire`` will take, to within one."""
+    return int((len(command) / COMMAND_HZ - CAMERA_START_S) * bench.microscope.frame_rate_hz)
+
+
+def ease(u: Tensor) -> Tensor:
+    """0 to 1 for u from 0 to 1, starting and ending without speed and acceleration; any shape."""
+    u = u.clamp(0, 1)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def _film(motion: StageMotion, bench: Bench) -> Sequence:
+    """The lens' point-spread and the pixel's own width blur the analytic scene exactly, instead of its pixels."""
+    microscope = bench.microscope
+    spread = (microscope.camera().blur_sigma ** 2 + 1 / 12) ** 0.5
+    settings = {"light": bench.light, "gain": bench.gain, "noise_sigma": bench.noise}
+    camera = microscope.camera(blur_sigma=0.0, **settings)
+    side = SIZE + 2 * AROUND
+    scene = Window(micrograph(sigma=spread), (side, side))
+    return microscope.film(scene, motion, start_s=CAMERA_START_S, camera=camera, seed=bench.seed)
+
+
+def _track(
+    film: Sequence, bench: Bench, seconds: dict[str, float], tick: Callable[[], None]
+) -> tuple[dict[str, Track], Tensor]:
+    """Every method on the same frames, and the first frame (H, W)."""
+    first = film.batch(0, 1)[0, 0]
+    trackers = {name: tracker_of(first, **options) for name, options in bench.methods.items()}
+    found: dict[str, list[Estimate]] = {name: [] for name in trackers}
+    for k in range(len(film)):
+        with _timed(seconds, "frames"):
+            frame = film.batch(k, k + 1)[0, 0]
+        for name, tracker in trackers.items():
+            with _timed(seconds, f"tracking, {name}"):
+                found[name].append(tracker(frame))
+        tick()
+    return {name: Track.stack(estimates) for name, estimates in found.items()}, first
+
+
+def _middle(size: tuple[int, int]) -> tuple[float, float]:
+    return float(size[1] // 2), float(size[0] // 2)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Adds the time that its block takes to ``seconds[name]``."""
+    start = time.perf_counter()
+    yield
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start

@@ -1,0 +1,163 @@
+"""Figs. 6 and 7: circles of 8 and 12 um, by camera and capacitive sensors. Simulated once for both figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.paper.acquisition import (
+    COMMAND_HZ,
+    ON_TABLE,
+    Acquisition,
+    Bench,
+    acquire,
+    ease,
+    frames_of,
+    zeroed,
+)
+from torch_ecc.paper.result import Advance
+from torch_ecc.records.calibration import Calibration
+from torch_ecc.records.curves import Circle, Ellipse, fit_circle, fit_ellipse, fit_line
+from torch_ecc.records.motion import Motion, nearest_errors
+from torch_ecc.records.synchrony import Alignment, Curve, align_records
+from torch_ecc.sim.stage.microscope import Microscope
+
+RADII = (8.0, 12.0)  # um, commanded
+ZOOM = 2.0  # 0.275 um per px
+REST_S = 0.05  # of the whole, at which both records are zeroed
+ON_RIM = 0.9  # of the largest distance from rest: the circular portion
+ON_LINE = (0.02, 0.95)  # the straight portion
+
+
+class Round(NamedTuple):
+    """One circle: both records zeroed at rest, and what the analyses make of them.
+
+    ``dynamic`` and the residuals of ``joint`` (., 3) um, um, rad are errors by the paper's method, of the circular
+    portion ``portion`` (.,) of the frames, and by the joint estimate. ``line_angle`` in rad is that of image against
+    stage by straight lines. ``known`` (3,) um, um, rad is the rms that is left with clocks and angle known exactly,
+    ``tracker``, ``lens`` and ``cds`` what the tracker, the vibration of the lens and the sensors have in it.
+    """
+
+    radius: float
+    axis_angle: float
+    acquired: Acquisition
+    track: Motion
+    sensors: Motion
+    portion: Tensor
+    dynamic: Tensor
+    joint: Alignment
+    line_angle: float
+    circle: Circle
+    ellipse: Ellipse
+    known: Tensor
+    tracker: Tensor
+    lens: Tensor
+    cds: Tensor
+
+
+_kept: dict[bool, list[Round]] = {}
+
+
+def rounds(quick: bool, advance: Advance) -> list[Round]:
+    """Both circles; simulated at the first call only. ``quick``: twice as fast, and a smaller part of the sensor."""
+    if quick not in _kept:
+        region = (240, 320) if quick else (480, 640)
+        bench = Bench(microscope=Microscope(zoom=ZOOM, region_px=region, **ON_TABLE))
+        commands = [command(radius, 5.0 if quick else 10.0) for radius in RADII]
+        total, done = sum(frames_of(c, bench) for c in commands), 0
+
+        def tick() -> None:
+            nonlocal done
+            done += 1
+            advance(min(done, total), total)
+
+        _kept[quick] = [one_round(RADII[k], commands[k], replace(bench, seed=k), tick) for k in range(len(RADII))]
+    return _kept[quick]
+
+
+def command(radius: float, length_s: float) -> Tensor:
+    """Rest, the line to (radius, 0), one round, the line back, rest: (T, 3) um, um, rad at 1 kHz, eased everywhere."""
+    u = torch.arange(0, length_s * COMMAND_HZ + 0.5, dtype=torch.float64) / (length_s * COMMAND_HZ)
+    out = radius * (ease((u - 0.1) / 0.15) - ease((u - 0.8) / 0.15))
+    phase = math.tau * ease((u - 0.25) / 0.55)
+    return torch.stack((out * phase.cos(), out * phase.sin(), 0 * u), -1)
+
+
+def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None]) -> Round:
+    """Simulate, track and analyse one circle."""
+    acquired = acquire(path, bench, tick)
+    rest = REST_S * len(path) / COMMAND_HZ
+    track, sensors = zeroed(acquired.tracks["ECC"], rest), zeroed(acquired.sensors, rest)
+    visual, sensed = circular(track), circular(sensors)
+    joint = align_records(track, sensors)
+    points = sensors.pose[sensed, :2]
+    turn = Calibration(1.0, bench.microscope.axis_angle)
+    turned, image = (turn.to_physical(m.pose) for m in (acquired.tracks["ECC"], acquired.truth))
+    at = acquired.truth.time_s + acquired.offset_s
+    real = acquired.motion.at(at)
+    return Round(
+        radius,
+        bench.microscope.axis_angle,
+        acquired,
+        track,
+        sensors,
+        visual,
+        nearest_errors(_cut(track, visual), _cut(sensors, sensed)),
+        joint,
+        line_angle(track, sensors),
+        fit_circle(points),
+        fit_ellipse(points),
+        _scatter(turned - Curve(acquired.sensors)(at)[0]),
+        _scatter(turned - image),
+        _scatter(image - real),
+        _scatter(acquired.sensors.pose - acquired.motion.at(acquired.sensors.time_s)),
+    )
+
+
+def circular(motion: Motion) -> Tensor:
+    """The circular portion as the record itself shows it: between the first and the last sample near the rim, (T,)."""
+    distance = motion.pose[:, :2].norm(dim=1).nan_to_num()
+    rim = (distance > ON_RIM * distance.max()).nonzero()[:, 0]
+    index = torch.arange(len(distance))
+    portion: Tensor = (index >= rim[0]) & (index <= rim[-1])
+    return portion
+
+
+def line_angle(track: Motion, sensors: Motion) -> float:
+    """Angle in rad from the image's axes to the stage's by straight lines, mean of the ways out and back."""
+    angles = []
+    for outward in (True, False):
+        image, stage = (fit_line(_line(motion, outward)).angle for motion in (track, sensors))
+        angles.append(math.remainder(image - stage, math.tau))
+    return sum(angles) / 2
+
+
+def common_angle(found: list[Round]) -> float:
+    """``line_angle`` of all circles together, weighted by what lines of such length tell: their length squared."""
+    weights = [r.radius**2 for r in found]
+    return sum(w * r.line_angle for w, r in zip(weights, found, strict=True)) / sum(weights)
+
+
+def _line(motion: Motion, outward: bool) -> Tensor:
+    """Points (N, 2) of the straight portion before, or after, the circle."""
+    distance = motion.pose[:, :2].norm(dim=1).nan_to_num()
+    rim = circular(motion).nonzero()[:, 0]
+    index = torch.arange(len(distance))
+    side = index < rim[0] if outward else index > rim[-1]
+    low, high = (share * distance.max() for share in ON_LINE)
+    return motion.pose[side & (distance > low) & (distance < high), :2]
+
+
+def _cut(motion: Motion, rows: Tensor) -> Motion:
+    return Motion(motion.time_s[rows], motion.pose[rows])
+
+
+def _scatter(errors: Tensor) -> Tensor:
+    """Standard deviations (3,) of errors (T, 3), lost frames left out."""
+    spread: Tensor = errors[errors.isfinite().all(1)].std(0)
+    return spread

@@ -1,0 +1,214 @@
+"""Fig. 3: errors of ECC and SSD along eq. (11), without and with uneven illumination (UI)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.pose import compose
+from torch_ecc.paper import scheme
+from torch_ecc.paper.fig3_plot import draw_curves, draw_templates
+from torch_ecc.paper.methods import METHODS, Follower, errors, largest
+from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table, counter
+from torch_ecc.plots.style import styled
+from torch_ecc.sim.camera.camera import Camera
+
+PAPER = {"gain": (0.05, 0.05), "ref34": (0.07, 0.35)}  # px, deg: the paper's largest errors with UI
+EVEN_LIMIT = (0.005, 0.005)  # px, deg, of every ecc without UI
+LIMITS = {"gain": (0.05, 0.05), "ecc_paper": (0.05, 0.05), "linear": (0.01, 0.01), "quadratic": (0.01, 0.01)}
+TEMPLATES, POSES, REACH = 13, 16, 700.0  # cut elsewhere, poses of each, px of the square that they are drawn from
+SEED = 1
+Errors = dict[str, dict[str, Tensor]]  # by camera and method: (F, 3) px, px, deg
+
+
+class Spread(NamedTuple):
+    """Largest errors (P, methods, 2) px, deg of P templates, the paper's first and then others, with UI.
+
+    ``first``: cut from the first frame; ``reflected``: cut from the evenly lit image.
+    """
+
+    first: Tensor
+    reflected: Tensor
+
+
+def run(quick: bool, advance: Advance) -> Outcome:
+    """Track and draw. ``quick``: half a cycle (the other half goes back the same way), the text's amplitudes only."""
+    motions = (scheme.TEXT,) if quick else (scheme.TEXT, scheme.CAPTION)
+    paths = {m: m.path()[: m.points // 2] if quick else m.path() for m in motions}
+    count, poses = (5, 6) if quick else (TEMPLATES, POSES)
+    tick = counter(sum(map(len, paths.values())) + count * poses, advance)
+    found = {motion: sequence_errors(path, tick) for motion, path in paths.items()}
+    spread = template_errors(count, poses, tick)
+    with styled():
+        pictures = [_curves(motion, e) for motion, e in found.items()]
+        pictures.append(_spread(spread))
+    tables = [_table(motion, e) for motion, e in found.items()] + [_spread_table(spread)]
+    records = [r for motion, e in found.items() for r in _records(motion, e)]
+    title = "Fig. 3: uneven illumination"
+    return Outcome("fig3", title, pictures, tables, records, _remarks(found, spread), SEED)
+
+
+def cameras() -> dict[str, Camera]:
+    """Without and with uneven light, 8 bit, no noise."""
+    return {
+        "without UI": Camera(size=scheme.FRAME, gain=scheme.GAIN),
+        "with UI": Camera(size=scheme.FRAME, gain=scheme.GAIN, light=scheme.uneven_light()),
+    }
+
+
+def sequence_errors(path: Tensor, tick: Callable[[], None]) -> Errors:
+    """All methods along ``path`` (F, 3); each camera's template is cut from its first frame."""
+    scene, cut, views = scheme.scene(), scheme.cut_first(path), cameras()
+    followers: dict[str, dict[str, Follower]] = {}
+    found: dict[str, dict[str, list[Tensor]]] = {c: {m: [] for m in METHODS} for c in views}
+    for pose in path.split(1):
+        clean = scheme.Kept(scene, scene.render(pose, scheme.FRAME))
+        for name, camera in views.items():
+            frame = camera.capture(clean, pose)
+            if name not in followers:
+                followers[name] = {m: METHODS[m].start(cut.template(frame), cut.start[None]) for m in METHODS}
+            for m, follower in followers[name].items():
+                found[name][m].append(follower.track(frame))
+        tick()
+    truth = cut.truth(path)
+    return {c: {m: errors(torch.cat(poses), truth) for m, poses in by.items()} for c, by in found.items()}
+
+
+def template_errors(count: int, poses: int, tick: Callable[[], None]) -> Spread:
+    """``count`` templates, the paper's and others, aligned from the truth at ``poses`` poses of the text's cycle."""
+    scene, (even, lit), middle = scheme.scene(), cameras().values(), scheme.cut_reflected()
+    path = scheme.TEXT.path()[:: scheme.TEXT.points // poses][:poses]
+    spots = REACH * (torch.rand(count, 2, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64) - 0.5)
+    spots[0] = 0
+    rows: tuple[list[Tensor], list[Tensor]] = ([], [])
+    for spot in spots:
+        shift = torch.cat((-spot, spot.new_zeros(1)))
+        still = even.capture(scene, compose(middle.pose, shift)[None])
+        frames = []
+        for pose in path.split(1):
+            frames.append(lit.capture(scene, compose(pose, shift[None])))
+            tick()
+        sequence = torch.cat(frames)
+        for row, cut, image in ((rows[0], scheme.cut_first(path), sequence[:1]), (rows[1], middle, still)):
+            row.append(_align_all(cut.template(image), sequence, cut.truth(path)))
+    return Spread(*(torch.stack(row) for row in rows))
+
+
+def _align_all(template: Tensor, frames: Tensor, truth: Tensor) -> Tensor:
+    """Largest errors (methods, 2) px, deg with one template over frames (F, 1, h, w), started at the truth (F, 3)."""
+    many = template.expand(len(frames), -1, -1, -1)
+    return torch.tensor([largest(errors(m.start(many, truth).track(frames), truth)) for m in METHODS.values()])
+
+
+def _curves(motion: scheme.Motion, found: Errors) -> Picture:
+    name = "fig3" if motion == scheme.TEXT else "fig3_caption"
+    caption = (
+        f"Errors along eq. (11), {motion}. First row ECC without and with uneven illumination, second row SSD; "
+        "the vertical scale of a component is the same without and with light. The numbers are the largest errors."
+    )
+    return Picture(name, draw_curves(found), caption)
+
+
+def _spread(spread: Spread) -> Picture:
+    panels = {"(a) templates from the first frame": spread.first, "(b) from the evenly lit image": spread.reflected}
+    caption = (
+        "How much depends on the template: largest errors with uneven light of the template in the middle of the "
+        f"micrograph (diamond) and of {len(spread.first) - 1} at random places (dots), text's amplitudes."
+    )
+    return Picture("fig3_templates", draw_templates(panels, PAPER), caption)
+
+
+def _table(motion: scheme.Motion, found: Errors) -> Table:
+    rows = []
+    for name, method in METHODS.items():
+        cells = [f"{v:.4f}" for camera in found.values() for v in largest(camera[name])]
+        paper = "{:g} px, {:g} deg".format(*PAPER[name]) if name in PAPER else ""
+        rows.append((method.label, *cells, paper))
+    header = ("method", "without UI, px", "deg", "with UI, px", "deg", "paper, with UI")
+    note = "Template cut from the first frame (Algorithm 1, line 3). px: the larger of x and y. 8 bit, no noise."
+    return Table(f"Largest errors, {motion}", header, rows, note)
+
+
+def _spread_table(spread: Spread) -> Table:
+    rows = []
+    for k, method in enumerate(METHODS.values()):
+        middle = "{:.4f} px, {:.4f} deg".format(*spread.reflected[0, k].tolist())
+        cells = [_range(values[1:, k, unit]) for values in spread for unit in (0, 1)]
+        rows.append((method.label, middle, *cells))
+    header = ("method", "middle, evenly lit", "elsewhere, first frame, px", "deg", "elsewhere, evenly lit, px", "deg")
+    title = f"Largest errors with UI by template: the middle one, and {len(spread.first) - 1} elsewhere"
+    note = (
+        "Evenly lit: cut from the image without UI, as the paper's text has it (Fig. 2(b)). Elsewhere: median "
+        "(smallest to largest). Aligned from the truth at every pose."
+    )
+    return Table(title, header, rows, note)
+
+
+def _range(values: Tensor) -> str:
+    return f"{values.quantile(0.5):.4f} ({values.min():.4f} to {values.max():.4f})"
+
+
+def _records(motion: scheme.Motion, found: Errors) -> list[Record]:
+    records = []
+    for camera, by_method in found.items():
+        for name, error in by_method.items():
+            limit = LIMITS.get(name) if camera == "with UI" else EVEN_LIMIT if name in LIMITS else None
+            paper = PAPER.get(name) if camera == "with UI" else None
+            for k, (value, unit) in enumerate(zip(largest(error), ("px", "deg"), strict=True)):
+                label = f"fig3 {motion.degrees:g} deg, {name}, {camera}, largest {'theta' if k else 'x, y'}"
+                records.append(Record(label, value, unit, tolerance=limit and limit[k], paper=paper and paper[k]))
+        if camera == "with UI":
+            ratio = largest(by_method["ref34"])[1] / largest(by_method["gain"])[1]
+            label = f"fig3 {motion.degrees:g} deg, theta error of ref34 over that of gain, with UI"
+            records.append(Record(label, ratio, "1", "higher", 2.0, PAPER["ref34"][1] / PAPER["gain"][1]))
+    return records
+
+
+def _remarks(by_motion: dict[scheme.Motion, Errors], spread: Spread) -> list[str]:
+    found = by_motion[scheme.TEXT]
+    lit = {name: largest(error) for name, error in found["with UI"].items()}
+    least, most = {}, {}
+    for k, name in enumerate(METHODS):
+        both = torch.cat((spread.first[1:, k], spread.reflected[1:, k]))
+        least[name], most[name] = both.amin(0).tolist(), both.amax(0).tolist()
+    remarks = [
+        f"With uneven light the paper's ECC (gain) errs by at most {lit['gain'][0]:.3f} px and {lit['gain'][1]:.3f} "
+        f"deg here (paper: 0.05 and 0.05), ref. 34 by {lit['ref34'][0]:.3f} px and {lit['ref34'][1]:.3f} deg (paper: "
+        f"0.07 and 0.35): ECC is better in theta by a factor of {lit['ref34'][1] / lit['gain'][1]:.1f} (paper: 7).",
+        "ECC is blind to one gain and one offset only. The columns t x', t y' (linear) and their squares and product "
+        f"(quadratic) also take out light that changes across the template: {lit['linear'][0]:.4f} px and "
+        f"{lit['linear'][1]:.4f} deg, {lit['quadratic'][0]:.4f} px and {lit['quadratic'][1]:.4f} deg, at no cost per "
+        "iteration.",
+        "Both SSD curves follow the light over the path, which is why they look like the cosine of the motion, as in "
+        "the paper's Fig. 3(d). No local minima are needed to explain that: with the wrong gain the least squares "
+        "itself has its minimum elsewhere, by an amount that depends on what the template's border cuts through.",
+        "That amount differs from template to template more than from method to method: elsewhere on the micrograph "
+        f"ref. 34 errs by up to {least['ref34'][1]:.3f} to {most['ref34'][1]:.3f} deg, gain by up to "
+        f"{least['gain'][0]:.3f} to {most['gain'][0]:.3f} px, beyond the paper's 0.05 px, linear by up to "
+        f"{most['linear'][0]:.3f} px, quadratic by up to {most['quadratic'][0]:.4f} px. The paper shows one template; "
+        "its 0.35 deg is one draw from such a spread.",
+        "ssd (constant Hessian, inverse compositional) and ref. 34 (Hessian anew, additive) find the same poses: what "
+        "is recomputed at every frame buys nothing, because in the template's own axes the Hessian does not depend on "
+        "theta.",
+        "What is left without uneven light is due to 8 bit, the cubic B-spline and the stop rule. The paper gives no "
+        "numbers for that case.",
+    ]
+    if scheme.CAPTION in by_motion:
+        ratio = [largest(by_motion[scheme.CAPTION]["with UI"][m])[1] for m in ("ref34", "gain")]
+        remarks.append(
+            "With the amplitudes of Fig. 2's caption the first frame, and the template that is cut upright from it, "
+            f"lies at another angle. On that template SSD is not worse in theta: ref. 34 {ratio[0]:.4f} deg, gain "
+            f"{ratio[1]:.4f} deg. Over the templates cut elsewhere it is worse by a median factor of "
+            f"{_theta_factor(spread):.1f}."
+        )
+    return remarks
+
+
+def _theta_factor(spread: Spread) -> float:
+    """Theta error of ref. 34 over that of gain, median over the templates cut elsewhere."""
+    theta = torch.cat((spread.first[1:, :, 1], spread.reflected[1:, :, 1]))
+    names = list(METHODS)
+    return float((theta[:, names.index("ref34")] / theta[:, names.index("gain")]).quantile(0.5))

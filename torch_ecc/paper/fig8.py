@@ -1,0 +1,73 @@
+"""Fig. 8: steps of theta as ECC and the capacitive sensors (CDS) see them."""
+
+from __future__ import annotations
+
+from matplotlib.figure import Figure
+
+from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
+from torch_ecc.paper.steps import METHODS, Staircase, staircase
+from torch_ecc.plots.style import new_figure, styled
+
+CDS, ECC = "#d55e00", "#0072b2"
+REMARKS = (
+    "The stage turns less than commanded, and differently on the way back: hysteresis and compliance, which is why the "
+    "sensors and not the commands are the reference.",
+    "The zoom is at its minimum, as in the paper: a pixel is 0.79 um.",
+)
+
+
+def run(quick: bool, advance: Advance) -> Outcome:
+    """The staircase, drawn as the paper's Fig. 8. ``quick``: dwells of 0.3 s instead of 3 s."""
+    found = staircase(quick, advance)
+    with styled():
+        figure = draw(found)
+    caption = (
+        "Tracking results of ECC and CDS for the angular trajectory, 0.04 deg steps to 0.24 deg and back. The inset "
+        "enlarges the highest step."
+    )
+    lost = sum(int((~track.pose.isfinite().all(1)).sum()) for track in found.tracks.values())
+    highest = float(found.dwells["CDS"].mean[:, 2].max().rad2deg())
+    clock = 1e6 * abs(found.alignment.offset_s - found.acquired.offset_s)
+    records = [
+        Record("fig8 lost frames", float(lost), "", tolerance=0.0),
+        Record("fig8 highest step by the CDS, 0.24 deg commanded", highest, "deg", "higher"),
+        Record("fig8 clock offset by the joint estimate, error", clock, "us", tolerance=1000.0),
+    ]
+    tables = [_table(found), _times(found)]
+    return Outcome("fig8", "Fig. 8: angular trajectory", [Picture("fig8", figure, caption)], tables, records, REMARKS)
+
+
+def _table(found: Staircase) -> Table:
+    rows = []
+    for k, level in enumerate(found.levels_deg.tolist()):
+        means = (found.dwells[name].mean[k, 2].rad2deg() for name in ("CDS", *METHODS))
+        rows.append((f"{k}", f"{level:.2f}", *(f"{float(mean):.5f}" for mean in means)))
+    return Table("Mean theta of each step, deg", ("step", "commanded", "CDS", *METHODS), rows)
+
+
+def _times(found: Staircase) -> Table:
+    seconds, (h, w) = found.acquired.seconds, found.acquired.first.shape
+    frames, samples = len(found.acquired.truth.time_s), len(found.sensors.time_s)
+    title = f"Time in s: {frames} frames of {w}x{h} px and {samples} samples of three sensors"
+    return Table(title, tuple(seconds), [tuple(f"{value:.1f}" for value in seconds.values())])
+
+
+def draw(found: Staircase) -> Figure:
+    """theta over time on the sensors' clock."""
+    figure = new_figure(9, 4.6)
+    axes = figure.subplots()
+    inset = axes.inset_axes((0.4, 0.08, 0.24, 0.34))
+    track, sensors = found.tracks["ECC"], found.sensors
+    ecc = (track.time_s + found.alignment.offset_s, track.pose[:, 2].rad2deg())
+    for panel in (axes, inset):
+        panel.plot(sensors.time_s, sensors.pose[:, 2].rad2deg(), color=CDS, lw=1.1, label="CDS")
+        panel.plot(*ecc, color=ECC, lw=0.7, label="ECC")
+    top = int(found.levels_deg.argmax())
+    start, end = found.windows_s[top].tolist()
+    middle = float(found.dwells["CDS"].mean[top, 2].rad2deg())
+    inset.set(xlim=(start, end), ylim=(middle - 0.012, middle + 0.012))
+    inset.tick_params(labelsize=7.5)
+    axes.indicate_inset_zoom(inset, edgecolor="0.4")
+    axes.set(xlabel="time (s)", ylabel=r"$\theta$ (deg)")
+    axes.legend(loc="upper left")
+    return figure

@@ -1,0 +1,142 @@
+"""Fig. 9: the parasitic translation of the template during the steps of theta."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from torch_ecc.paper.parasitic import (
+    Deviations,
+    aliased,
+    deviations,
+    lever_arm,
+    other_sensors,
+    predicted,
+    scattered,
+    sensed,
+    true_deviations,
+)
+from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
+from torch_ecc.paper.steps import VIEW_UM, Staircase, staircase
+from torch_ecc.plots.style import COMPONENTS, letter, new_figure, styled
+
+UP, DOWN, LAW = "#0072b2", "#d55e00", "#1b1b1b"
+SETS = 200  # of sensors, against which the same track is held
+REMARKS = (
+    "The template lies 1.8 mm from the origin of the moving part, whose own x and y the sensors give: what it moves in "
+    "addition is (R(theta) - 1) lever arm. The sensors' theta times the true lever arm is the line beside it.",
+    "Most of the deviation in y is the sensors' theta: the non-linearity of one set of them bends it for all steps "
+    "alike, so that the steps of one run are all too high or all too low together. Chi-square counts that once, by the "
+    f"covariance of all steps; it is 1 per degree of freedom on average. {SETS} other sets of sensors along the same "
+    "motion show that sigma is right.",
+    "By the stage's true angle, which only a simulation knows, the tracker and the lens are left. Their error does not "
+    "average out within a step: it is what the sampler's aliasing makes of the template's place between the pixels.",
+)
+
+
+def run(quick: bool, advance: Advance) -> Outcome:
+    """x and y of ECC while theta steps, drawn as the paper's Fig. 9. ``quick``: dwells of 0.3 s."""
+    found = staircase(quick, advance)
+    by_sensors, by_truth = deviations(found), true_deviations(found)
+    with styled():
+        figure = draw(found, by_sensors, by_truth)
+    caption = (
+        "Translation of ECC during the angular trajectory. (a) in the plane, ascent and descent; (b) its components "
+        "over time. Black and grey: lever arm times the sensors' angle, which rings after each step. "
+        "(c) means of the steps minus lever arm times angle, with their standard deviations."
+    )
+    lever, spread = lever_arm(found, by_sensors.covariance)
+    share = float(((lever - lever.new_tensor(VIEW_UM)).abs() / spread).max())
+    others = _rms(torch.stack([some.nm / some.sigma for some in other_sensors(found, SETS)]))
+    records = [
+        Record("fig9 lever arm from the steps: error over its sigma", share, "", tolerance=3.0),
+        Record("fig9 steps: rms deviation from lever arm times angle", _rms(by_sensors.nm), "nm"),
+        Record("fig9 steps: chi-square per degree of freedom", by_sensors.chi_square, "", tolerance=2.0),
+        Record("fig9 steps by the true angle: rms deviation", _rms(by_truth.nm), "nm"),
+        Record("fig9 steps by the true angle: chi-square", by_truth.chi_square, "", tolerance=2.0),
+        Record(f"fig9 steps: rms deviation over sigma with {SETS} other sets of sensors", others, "", tolerance=1.2),
+    ]
+    rows = [
+        ("true", *(f"{v:.2f}" for v in VIEW_UM)),
+        ("from the steps", *(f"{v:.2f} +- {s:.2f}" for v, s in zip(lever.tolist(), spread.tolist(), strict=True))),
+    ]
+    tables = [Table("Lever arm", ("", "x, um", "y, um"), rows), _table(found, by_sensors), _budget(found)]
+    return Outcome(
+        "fig9", "Fig. 9: parasitic translation", [Picture("fig9", figure, caption)], tables, records, REMARKS
+    )
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt())
+
+
+def _table(found: Staircase, left: Deviations) -> Table:
+    rows = []
+    for k, (d, s) in enumerate(zip(left.nm.tolist(), left.sigma.tolist(), strict=True), start=1):
+        x, y, theta = found.dwells["ECC"].mean[k].tolist()
+        cells = (f"{v:.1f} +- {e:.1f}" for v, e in zip(d, s, strict=True))
+        rows.append((f"{k}", f"{1e6 * theta:.0f}", f"{x:.4f}", f"{y:.4f}", *cells))
+    header = ("step", "theta, urad", "x, um", "y, um", "x minus the law, nm", "y minus the law, nm")
+    return Table("Translation of each step by ECC, and its deviation from lever arm times angle", header, rows)
+
+
+def _budget(found: Staircase) -> Table:
+    """What sigma is made of."""
+    cds = found.dwells["CDS"].mean[1:]
+    causes = {
+        "scatter of the frames": scattered(found)[1:] + scattered(found)[0],
+        "sampler's aliasing": aliased(found)[1:].diagonal(dim1=1, dim2=2),
+        "sensors' non-linearity": sensed(cds).diagonal().reshape(-1, 2),
+    }
+    top = int(cds[:, 2].argmax())
+    rows = [(name, *(f"{v:.2f}" for v in variance[top].sqrt().tolist())) for name, variance in causes.items()]
+    return Table("Sigma of the deviation at the highest step by its causes", ("", "x, nm", "y, nm"), rows)
+
+
+def draw(found: Staircase, by_sensors: Deviations, by_truth: Deviations) -> Figure:
+    """(a) in the plane, (b) over time, (c) means minus the law."""
+    figure = new_figure(14, 4.4)
+    plane, parts, left = figure.subplots(1, 3, width_ratios=(1, 1.35, 1.35))
+    track, sensors = found.tracks["ECC"], found.sensors
+    time = track.time_s + found.alignment.offset_s
+    top = int(found.levels_deg.argmax())
+    turning = float(found.windows_s[top].mean())
+    law = predicted(sensors.pose)
+    for rows, colour, words in ((time < turning, UP, "ascent"), (time >= turning, DOWN, "descent")):
+        plane.plot(*track.pose[rows, :2].T, ".", ms=2, color=colour, label=words)
+    plane.plot(*law[::16].T, color=LAW, lw=0.8, label=r"lever arm x $\theta$ of CDS")
+    plane.set(xlabel="x (um)", ylabel="y (um)")
+    plane.set_aspect("equal", "datalim")
+    plane.legend(loc="upper left", markerscale=3)
+    letter(plane, "(a) in the plane")
+    _draw_parts(parts, time, track.pose, (sensors.time_s, law))
+    _draw_left(left, by_sensors, by_truth)
+    return figure
+
+
+def _draw_parts(axes: Axes, time: Tensor, pose: Tensor, law: tuple[Tensor, Tensor]) -> None:
+    for i, colour in enumerate((UP, DOWN)):
+        axes.plot(law[0], law[1][:, i], color="0.6", lw=0.6)
+        axes.plot(time, pose[:, i], color=colour, lw=0.9, label=COMPONENTS[i])
+    axes.set(xlabel="time (s)", ylabel="x, y (um)")
+    axes.legend(loc="lower left")
+    letter(axes, "(b) components")
+
+
+def _draw_left(axes: Axes, by_sensors: Deviations, by_truth: Deviations) -> None:
+    steps = torch.arange(1, len(by_sensors.nm) + 1)
+    for some, words, mark, shift in ((by_sensors, "angle of CDS", "o", -0.15), (by_truth, "true angle", "s", 0.15)):
+        for i, colour in enumerate((UP, DOWN)):
+            look: Any = {"ls": "", "ms": 4, "capsize": 2, "lw": 1, "mfc": colour if some is by_sensors else "white"}
+            look |= {"marker": mark, "color": colour, "label": f"{COMPONENTS[i]}, {words}"}
+            axes.errorbar(steps + shift, some.nm[:, i], some.sigma[:, i], **look)
+    axes.axhline(0, color="0.6", lw=0.8)
+    axes.set(xlabel="step, up and down", ylabel=r"minus lever arm x $\theta$ (nm)", xticks=steps)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
+    axes.legend(fontsize=8, ncols=2, loc="upper center")
+    letter(axes, "(c) deviation of the means")

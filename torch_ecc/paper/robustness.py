@@ -1,0 +1,184 @@
+"""Robustness beyond the paper: how often a template is found again, over what can go wrong between two frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table, counter
+from torch_ecc.paper.robustness_plot import Panel, draw_panels
+from torch_ecc.paper.scheme import SIZE
+from torch_ecc.paper.trials import (
+    FOUND,
+    FRAME,
+    JUMP,
+    MIDDLE,
+    NOISE,
+    SEED,
+    TURN,
+    UNNOTICED,
+    Change,
+    Found,
+    camera,
+    sampler_errors,
+    sweep,
+)
+from torch_ecc.plots.style import styled
+from torch_ecc.sim.camera.occluder import Occluder
+
+COUNT = 48  # templates
+SAMPLERS = ("bilinear", "bspline3", "bspline5")
+ENOUGH = 0.9  # share of the templates
+MEAN = 128.0  # grey level that stays when contrast goes
+
+
+class Sweep(NamedTuple):
+    """What is varied, from easy to hard."""
+
+    title: str
+    label: str
+    levels: Sequence[float]
+    change: Callable[[float], Change]
+
+
+def covered(share: float) -> Change:
+    """Something dark in front of the camera covers that share of the template from one side, up to the jump."""
+    right = float(MIDDLE[0]) - SIZE / 2 + share * SIZE
+    occluder = Occluder(center=(right / 2 - 50, FRAME[0] / 2), half_size=(right / 2 + 50, FRAME[0]))
+    return Change(camera=camera(occluders=(occluder,) if share else ()))
+
+
+def dimmed(contrast: float) -> Change:
+    """That share of the contrast is left; the noise stays."""
+    return Change(camera=camera(gain=contrast, offset=MEAN * (1 - contrast)))
+
+
+BASIN = {
+    "jump": Sweep("jump", "jump between frames (px)", (1, 4, 8, 12, 18, 25, 35, 50), lambda v: Change(jump=v, turn=0)),
+    "turn": Sweep("turn", "turn between frames (deg)", (1, 4, 8, 12, 18, 25, 35, 50), lambda v: Change(jump=0, turn=v)),
+}
+SWEEPS = {
+    "blur": Sweep(
+        "blur",
+        "blur of the frame, sigma (px)",
+        (0, 1, 2, 3, 4, 5, 6),
+        lambda v: Change(camera=camera(blur_sigma=v)),
+    ),
+    "occlusion": Sweep("occlusion", "covered share of the template", (0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4), covered),
+    "contrast": Sweep("contrast", "contrast left in the frame", (1, 0.5, 0.2, 0.1, 0.05, 0.03, 0.02), dimmed),
+    "size": Sweep(
+        "template size", "side of the template (px)", (121, 81, 51, 31, 21, 15, 11), lambda v: Change(size=int(v))
+    ),
+}
+REMARKS = (
+    f"Templates of {SIZE} px at random places and angles of the default micrograph, some of them on little texture. "
+    f"Where they are not varied: a jump of {JUMP:g} px in any direction, a turn of {TURN:g} deg, noise of {NOISE:g} "
+    "grey levels in template and frame. Every method starts at the pose of the frame before.",
+    f"Found: nearer than {FOUND:g} px to the truth at the template's corner. The red line counts what the default "
+    "(over jumps and turns the tracker with its search) calls a good pose and is not: what its status does not tell.",
+    "A jump or turn beyond the width of the texture leads into a neighbouring minimum, whatever the criterion, and on "
+    "a circuit of many equal cells that minimum often looks good enough to be believed. What widens the basin is the "
+    "pyramid. The tracker's search, its default, looks at the whole frame when a template is lost or looks less like "
+    "itself than it did before. The columns for light cost some of the basin.",
+    "Contrast is no failure to ECC, which fits a gain: it works until the noise is as large as what is left. SSD takes "
+    "a change of contrast for motion. Blur mixes in what lies around the template, which no method here models.",
+    "Nor does any model an occluder. A partly covered template is pulled aside and soon refused: below a correlation "
+    "of 0.5 its status is LOST, and it counts as not found. Ref. 34 has no status and never refuses. A mask or a "
+    "smaller template serves better.",
+)
+
+
+def run(quick: bool, advance: Advance) -> Outcome:
+    """Sweep and draw. ``quick``: a sixth of the templates, every other level."""
+    count, step = (COUNT // 6, 2) if quick else (COUNT, 1)
+    sweeps = {name: s._replace(levels=s.levels[::step]) for name, s in (BASIN | SWEEPS).items()}
+    tick = counter(sum(len(s.levels) for s in sweeps.values()) + 2, advance)
+    found = {
+        name: sweep([s.change(v) for v in s.levels], count, tick, trackers=name in BASIN) for name, s in sweeps.items()
+    }
+    errors = {noise: sampler_errors(noise, count, SAMPLERS, tick) for noise in (0.0, NOISE)}
+    with styled():
+        pictures = [_basin(sweeps, found), *(_picture(name, sweeps[name], found[name]) for name in SWEEPS)]
+        pictures.append(_samplers(errors))
+    tables = [_table(sweeps, found, count), _sampler_table(errors)]
+    records = [
+        Record(f"robustness {name}: {sweeps[name].label} up to which {ENOUGH:.0%} are found, {m}", limit, "1", better)
+        for name in sweeps
+        for m, limit in limits(sweeps[name], found[name]).items()
+        for better in ["lower" if name in ("contrast", "size") else "higher"]
+    ]
+    return Outcome("robustness", "Robustness beyond the paper", pictures, tables, records, REMARKS, SEED)
+
+
+def limits(swept: Sweep, found: Found) -> dict[str, float]:
+    """By method: the hardest level before the first at which fewer than ENOUGH are found; NaN if there is none."""
+    result = {}
+    for name, rate in found.rate.items():
+        kept = next((k for k, r in enumerate(rate) if r < ENOUGH), len(rate))
+        if name != UNNOTICED:
+            result[name] = float(swept.levels[kept - 1]) if kept else math.nan
+    return result
+
+
+def _rates(title: str, swept: Sweep, found: Found, log: str = "") -> Panel:
+    curves = {name: (swept.levels, rate) for name, rate in found.rate.items()}
+    return Panel(f"{title} templates found", (swept.label, "share of the templates"), curves, log)
+
+
+def _basin(sweeps: Mapping[str, Sweep], found: Mapping[str, Found]) -> Picture:
+    panels = [_rates(f"({letter})", sweeps[name], found[name]) for letter, name in zip("ab", BASIN, strict=True)]
+    caption = (
+        "Basin: how far the start may be from the answer, in (a) position and (b) angle. "
+        '"3 levels" is a pyramid, "search" the tracker\'s default, which searches the frame.'
+    )
+    return Picture("basin", draw_panels(panels), caption)
+
+
+def _picture(name: str, swept: Sweep, found: Found) -> Picture:
+    log = "x" if name == "contrast" else ""
+    errors = {m: (swept.levels, values) for m, values in found.error.items() if values}
+    panel = Panel("(b) error of those found", (swept.label, "median error at the corner (px)"), errors, log + "y")
+    caption = f"Over {swept.title}: (a) share of the templates found, (b) how exactly."
+    return Picture(name, draw_panels([_rates("(a)", swept, found, log), panel]), caption)
+
+
+def _samplers(errors: Mapping[float, Mapping[str, Tensor]]) -> Picture:
+    panels = []
+    for letter, (noise, by_sampler) in zip("ab", errors.items(), strict=True):
+        curves = {
+            name: (values.tolist(), (torch.arange(1, len(values) + 1) / len(values)).tolist())
+            for name, values in by_sampler.items()
+        }
+        title = f"({letter}) noise of {noise:g} grey levels"
+        panels.append(Panel(title, ("error of x and y (px)", "share of the templates found"), curves, "x"))
+    return Picture("sampler", draw_panels(panels), "Errors of the default method by sampler: share below.")
+
+
+def _table(sweeps: Mapping[str, Sweep], found: Mapping[str, Found], count: int) -> Table:
+    names = list(found["jump"].rate)[:-1]
+    rows = []
+    for name, swept in sweeps.items():
+        limit = limits(swept, found[name])
+        cells = [
+            "none" if m in limit and math.isnan(limit[m]) else f"{limit[m]:g}" if m in limit else "" for m in names
+        ]
+        rows.append((swept.label, *cells, f"{max(found[name].rate[UNNOTICED]):.0%}"))
+    note = (
+        f"{count} templates, levels as in the pictures. Last column: most, at any level, that the default method gave "
+        "a wrong pose without noticing."
+    )
+    return Table(f"The hardest level up to which {ENOUGH:.0%} are found", ("", *names, "not noticed"), rows, note)
+
+
+def _sampler_table(errors: Mapping[float, Mapping[str, Tensor]]) -> Table:
+    rows = []
+    for name in SAMPLERS:
+        levels = torch.tensor((0.5, 0.9), dtype=torch.float64)
+        cells = [f"{v:.4f}" for by_sampler in errors.values() for v in by_sampler[name].double().quantile(levels)]
+        rows.append((name, *cells))
+    header = ["sampler", *(f"{what}, noise {noise:g}" for noise in errors for what in ("median px", "9 of 10 below"))]
+    return Table("Errors of x and y by sampler", header, rows, "Default method, position error.")

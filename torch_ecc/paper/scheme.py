@@ -1,0 +1,139 @@
+"""The paper's simulation scheme (section IV-A.1): a micrograph, its light, its motion and where templates are cut."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.pose import compose, inverse, rotation, transform
+from torch_ecc.core.reference import MARGIN
+from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.sim.camera.light import FieldLight, GradientLight, Lights, VignetteLight
+from torch_ecc.sim.camera.motion import harmonic, placed
+from torch_ecc.sim.scene.micrograph import micrograph
+from torch_ecc.sim.scene.retinex import Retinex, single_scale
+from torch_ecc.sim.scene.scene import Scene
+
+SIZE = 121  # px, side of the paper's template
+FRAME = (480, 640)  # (h, w) px
+CENTRE = (320.0, 240.0)  # px, where the motion has its middle
+GAIN = 0.75  # exposure of the sequences of Fig. 3: the brightest spot of the uneven light stays below white
+LAMP = Lights((VignetteLight(0.4), GradientLight(0.5, 0.3)))  # a lamp off the axis, behind a lens
+SURROUND = 150.0  # px, Gaussian of the Retinex surround: wider than any block of the micrograph
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Eq. (11): ``amplitude`` px in x and y and ``degrees`` in theta, ``points`` in a cycle."""
+
+    amplitude: float
+    degrees: float
+    points: int
+
+    def path(self) -> Tensor:
+        """Poses (points, 3) px, px, rad of the scene about the middle of the frame."""
+        turn = math.radians(self.degrees)
+        return placed(harmonic((self.amplitude, self.amplitude, turn), self.points), CENTRE)
+
+    def __str__(self) -> str:
+        return f"{self.amplitude:g} px, {self.degrees:g} deg, Nop {self.points}"
+
+
+TEXT = Motion(100.0, 20.0, 160)  # as the text has it
+CAPTION = Motion(100.0, 12.0, 200)  # as the caption of Fig. 2 has it
+
+
+class Cut(NamedTuple):
+    """Where templates are cut: ``pose`` (3,) of the scene in the image they are cut from, and their own ``start``
+    (3,) in that image, upright and on whole pixels."""
+
+    pose: Tensor
+    start: Tensor
+
+    def truth(self, path: Tensor) -> Tensor:
+        """Exact poses (F, 3) of the template when the scene moves along ``path`` (F, 3)."""
+        own = compose(inverse(self.pose), self.start)
+        return compose(path, own.expand_as(path))
+
+    def seen(self, scene: Scene) -> Turned:
+        """``scene`` in the template's own coordinates."""
+        return Turned(scene, compose(inverse(self.pose), self.start))
+
+    def template(self, image: Tensor, size: int = SIZE) -> Tensor:
+        """The template (..., size + 2 MARGIN, size + 2 MARGIN) of images (..., h, w), with its surroundings."""
+        reach = size // 2 + MARGIN
+        x, y = self.start[:2].long().tolist()
+        return image[..., y - reach : y + reach + size % 2, x - reach : x + reach + size % 2]
+
+
+def cut_first(path: Tensor) -> Cut:
+    """Templates cut from the first frame of a sequence, light and noise included (Algorithm 1, line 3)."""
+    return Cut(path[0], path[0].round() * path.new_tensor((1.0, 1.0, 0.0)))
+
+
+def cut_reflected() -> Cut:
+    """Templates cut from the middle of the evenly lit image (text of section IV-A.1, Fig. 2(b))."""
+    middle = torch.tensor((*CENTRE, 0.0), dtype=torch.float64)
+    return Cut(middle, middle)
+
+
+def scene() -> Scene:
+    """What the reflected component shows, known exactly everywhere: the default micrograph."""
+    return micrograph()
+
+
+def original() -> Tensor:
+    """Fig. 2(a): the micrograph under uneven light, (1, 1, 480, 640) uint8."""
+    return Camera(size=FRAME, light=LAMP).capture(scene(), cut_reflected().pose[None])
+
+
+def components() -> Retinex:
+    """Fig. 2(b), (c): reflected and incident component of the original, (1, 1, 480, 640) each."""
+    return single_scale(original().float(), SURROUND)
+
+
+def uneven_light() -> FieldLight:
+    """The incident component of the original as the light of a sequence: it stays with the camera."""
+    return FieldLight(components().incident[0, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """A scene in the coordinates of something that lies in it at ``pose`` (3,); for the Cramer-Rao bound."""
+
+    scene: Scene
+    pose: Tensor
+
+    def value(self, points: Tensor) -> Tensor:
+        """(..., 2) -> (...)."""
+        return self.scene.value(transform(self.pose, points))
+
+    def gradient(self, points: Tensor) -> Tensor:
+        """(..., 2) -> (..., 2): along the own axes."""
+        return self.scene.gradient(transform(self.pose, points)) @ rotation(self.pose[2])
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """A scene rendered once: ``frames`` (1 or B, 1, H, W) stand for its rendering at the same pose or poses, for
+    any number of cameras and draws of the noise."""
+
+    scene: Scene
+    frames: Tensor
+
+    def value(self, points: Tensor) -> Tensor:
+        """(..., 2) -> (...)."""
+        return self.scene.value(points)
+
+    def gradient(self, points: Tensor) -> Tensor:
+        """(..., 2) -> (..., 2)."""
+        return self.scene.gradient(points)
+
+    def render(self, poses: Tensor, size: tuple[int, int]) -> Tensor:
+        """The middle (B, 1, h, w) of the frames kept, for B poses."""
+        top, left = ((have - want) // 2 for have, want in zip(self.frames.shape[-2:], size, strict=True))
+        return self.frames[:, :, top : top + size[0], left : left + size[1]].expand(len(poses), -1, -1, -1)

@@ -1,0 +1,95 @@
+"""Figs. 8 to 11: steps of theta of 0.04 deg up to 0.24 deg and back under uneven light, by ECC, SSD and CDS.
+
+Simulated once for all four figures.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.paper.acquisition import COMMAND_HZ, ON_TABLE, Acquisition, Bench, acquire, frames_of, zeroed
+from torch_ecc.paper.result import Advance
+from torch_ecc.records.calibration import Calibration
+from torch_ecc.records.motion import Dwells, Motion, dwell_errors
+from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
+from torch_ecc.sim.camera.light import GradientLight, LampDrift, Lights
+from torch_ecc.sim.stage.microscope import Microscope
+
+STEP_DEG, HIGHEST = 0.04, 6
+LEVELS = (*range(HIGHEST + 1), *range(HIGHEST - 1, -1, -1))  # in steps
+ZOOM = 0.7  # "the focal length of the zoom lens is set to the minimum"
+VIEW_UM = (1500.0, -1000.0)  # the template, from the origin of the stage's moving part
+LAMP = 0.2  # of its light that the lamp gains in the first half of the staircase, and loses in the second
+GAIN = 0.8  # of the camera, so that nothing is clipped at that
+SETTLE_S = 0.15  # after which a dwell is counted
+METHODS = {"ECC": {}, "ECC, gain": {"illumination": "gain"}, "SSD": {"criterion": "ssd"}}
+
+
+class Staircase(NamedTuple):
+    """Records zeroed at rest, and their dwells: ``tracks`` and ``dwells`` by method, "CDS" among the dwells.
+
+    ``alignment`` is that of ECC with the sensors, with the lever arm from the sensors' point to the template;
+    ``levels_deg`` (K,) what was commanded; ``windows_s`` (K, 2) where each dwell counts on the sensors' clock;
+    ``calibration`` from the image to the stage.
+    """
+
+    acquired: Acquisition
+    tracks: dict[str, Motion]
+    sensors: Motion
+    dwells: dict[str, Dwells]
+    alignment: Alignment
+    levels_deg: Tensor
+    windows_s: Tensor
+    calibration: Calibration
+
+    def absolute_errors(self, method: str) -> Tensor:
+        """The paper's absolute errors (K, 3) um, um, rad: the mean of each step minus that of the CDS."""
+        return self.dwells[method].mean - self.dwells["CDS"].mean
+
+
+_kept: dict[bool, Staircase] = {}
+
+
+def staircase(quick: bool, advance: Advance) -> Staircase:
+    """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
+    if quick not in _kept:
+        _kept[quick] = _run(0.3 if quick else 3.0, (240, 320) if quick else (480, 640), advance)
+    return _kept[quick]
+
+
+def command(dwell_s: float) -> Tensor:
+    """Thirteen dwells of theta at (0, 0): (T, 3) um, um, rad at 1 kHz."""
+    theta = math.radians(STEP_DEG) * torch.tensor(LEVELS, dtype=torch.float64)
+    turn = theta.repeat_interleave(round(dwell_s * COMMAND_HZ))
+    return torch.stack((0 * turn, 0 * turn, turn), -1)
+
+
+def _run(dwell_s: float, region: tuple[int, int], advance: Advance) -> Staircase:
+    microscope = Microscope(zoom=ZOOM, region_px=region, view_um=VIEW_UM, **ON_TABLE)
+    bench, path = Bench(microscope=microscope, methods=METHODS), command(dwell_s)
+    total, done = frames_of(path, bench), 0
+    bench = replace(bench, gain=GAIN, light=Lights((GradientLight(), LampDrift(LAMP, period=2.2 * total))))
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        advance(min(done, total), total)
+
+    acquired = acquire(path, bench, tick)
+    angle, rest = microscope.axis_angle, dwell_s / 4  # the angle is known from the circles
+    turn, calibration = Calibration(1.0, angle), Calibration(microscope.um_per_px, angle)
+    sensors = zeroed(acquired.sensors, rest)
+    tracks = {name: zeroed(Motion(m.time_s, turn.to_physical(m.pose)), rest) for name, m in acquired.tracks.items()}
+    unknowns = Unknowns(angle=False, lever=True, max_offset_s=0.5)
+    alignment = align_records(tracks["ECC"], sensors, unknowns)
+    starts = dwell_s * torch.arange(len(LEVELS), dtype=torch.float64)
+    windows = torch.stack((starts + SETTLE_S, starts + dwell_s - 0.01), 1)
+    dwells = {name: dwell_errors(m, windows - alignment.offset_s) for name, m in tracks.items()}
+    dwells["CDS"] = dwell_errors(sensors, windows)
+    levels = STEP_DEG * torch.tensor(LEVELS, dtype=torch.float64)
+    return Staircase(acquired, tracks, sensors, dwells, alignment, levels, windows, calibration)

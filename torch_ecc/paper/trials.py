@@ -1,0 +1,161 @@
+"""Trials: templates at random places of the micrograph, found again, or not, in a frame where something has changed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.estimate import Status
+from torch_ecc.core.pose import compose
+from torch_ecc.paper.methods import METHODS, Aligned, Follower, errors
+from torch_ecc.paper.scheme import SIZE, Cut, Kept, scene
+from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.track.tracker import AT_ONCE, Tracker
+
+FRAME = (320, 320)  # (h, w) px
+MIDDLE = torch.tensor((160.0, 160.0, 0.0), dtype=torch.float64)  # where templates are in their first frame
+REACH = 1000.0  # px of the square on the micrograph that templates are drawn from
+BORDER = 24  # px rendered around a frame, for its blur
+FOUND = 0.5  # px at the template's corner: a template nearer than that is found
+JUMP, TURN, NOISE = 2.0, 1.0, 2.0  # px, deg and grey levels, where they are not what is varied
+METHODS_USED = ("linear", "gain", "ecc_paper", "ssd", "ref34")
+TRACKERS: dict[str, dict[str, Any]] = {  # the default method with what is in reserve
+    "linear, 3 levels": {"levels": 3, "search": False},
+    "linear, search": {"search": True},
+}
+UNNOTICED = "wrong, not noticed"
+SEED = 5
+
+
+def camera(**options: Any) -> Camera:
+    """The camera of all trials, 8 bit, with whatever is varied."""
+    settings: dict[str, Any] = {"size": FRAME, "noise_sigma": NOISE}
+    return Camera(**(settings | options))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """What happens between the frame that templates of ``size`` px are cut from and the next one."""
+
+    jump: float = JUMP  # px, in any direction
+    turn: float = TURN  # deg, either way
+    size: int = SIZE
+    camera: Camera = field(default_factory=camera)  # of the second frame
+
+
+class Found(NamedTuple):
+    """Over the levels of a sweep, by method: the share of templates found and the median error px of those."""
+
+    rate: dict[str, list[float]]
+    error: dict[str, list[float]]
+
+
+class Pairs(NamedTuple):
+    """B scene poses in the first and in the second frame, and the templates' true poses in the second, (B, 3) each."""
+
+    first: Tensor
+    second: Tensor
+    truth: Tensor
+
+
+def pairs(count: int, jump: float, turn: float) -> Pairs:
+    """The same ``count`` places, angles and directions for every ``jump`` (px) and ``turn`` (deg)."""
+    source = torch.Generator().manual_seed(SEED)
+    x, y, angle, way, sign = torch.rand(5, count, generator=source, dtype=torch.float64)
+    place = torch.stack((REACH * (x - 0.5), REACH * (y - 0.5), math.tau * angle), -1)
+    side = torch.where(sign < 0.5, -1.0, 1.0)
+    way = math.tau * way
+    move = torch.stack((jump * way.cos(), jump * way.sin(), math.radians(turn) * side), -1)
+    truth = MIDDLE + move
+    return Pairs(compose(MIDDLE.expand_as(place), place), compose(truth, place), truth)
+
+
+@lru_cache(maxsize=1)
+def _rendered(count: int, jump: float, turn: float) -> Kept:
+    """The second frames without what the camera does to them, and with a border."""
+    second = pairs(count, jump, turn).second + torch.tensor((BORDER, BORDER, 0.0), dtype=torch.float64)
+    return Kept(scene(), scene().render(second, (FRAME[0] + 2 * BORDER, FRAME[1] + 2 * BORDER)))
+
+
+def sweep(changes: Sequence[Change], count: int, tick: Callable[[], None], *, trackers: bool = False) -> Found:
+    """All methods, with ``trackers`` also those, over changes that make one thing worse and worse."""
+    names = [*METHODS_USED, *(TRACKERS if trackers else ())]
+    found = Found({name: [] for name in (*names, UNNOTICED)}, {name: [] for name in names})
+    first = camera().capture(scene(), pairs(count, 0, 0).first, seed=SEED)
+    prepared: dict[int, dict[str, Follower]] = {}
+    for change in changes:
+        both = pairs(count, change.jump, change.turn)
+        frames = change.camera.capture(_rendered(count, change.jump, change.turn), both.second, seed=SEED + 1)
+        if change.size not in prepared:
+            prepared[change.size] = _prepare(first, change.size)
+        poses, believed = _track(prepared[change.size], frames)
+        if trackers:
+            more, believed = _track_once(first, frames, change.size)
+            poses |= more
+        errors = {name: corner_error(pose, both.truth, change.size) for name, pose in poses.items()}
+        for name, error in errors.items():
+            good = error < FOUND
+            found.rate[name].append(float(good.double().mean()))
+            found.error[name].append(float(error[good].quantile(0.5)) if bool(good.any()) else math.nan)
+        watched = errors["linear, search" if trackers else "linear"]
+        found.rate[UNNOTICED].append(float((believed & (watched >= FOUND)).double().mean()))
+        tick()
+    return found
+
+
+def _prepare(first: Tensor, size: int) -> dict[str, Follower]:
+    template = Cut(MIDDLE, MIDDLE).template(first, size)
+    return {name: METHODS[name].start(template, MIDDLE.expand(len(first), 3)) for name in METHODS_USED}
+
+
+def _track(followers: Mapping[str, Follower], frames: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+    """Poses (B, 3) by method, started at the first frame's; and where the default one calls its pose good, (B,)."""
+    poses, believed = {}, torch.ones(len(frames), dtype=torch.bool)
+    for name, follower in followers.items():
+        follower.pose = MIDDLE.expand(len(frames), 3)
+        poses[name] = follower.track(frames)
+        if name == "linear" and isinstance(follower, Aligned):
+            believed = Status.good(follower.found.status)
+    return poses, believed
+
+
+def _track_once(first: Tensor, frames: Tensor, size: int) -> tuple[dict[str, Tensor], Tensor]:
+    """Poses (B, 3) by tracker; and where the one that searches, the default, calls its pose good, (B,)."""
+    poses, good = {}, torch.ones(len(first), dtype=torch.bool)
+    for name, options in TRACKERS.items():
+        # So few at once that all that need it are searched for in this very frame.
+        found = [
+            Tracker(before, MIDDLE[:2].expand(len(before), 2), size, prediction="hold", **options)(after)
+            for before, after in zip(first.split(AT_ONCE), frames.split(AT_ONCE), strict=True)
+        ]
+        poses[name] = torch.cat([estimate.pose for estimate in found])
+        good = Status.good(torch.cat([estimate.status for estimate in found]))
+    return poses, good
+
+
+def corner_error(pose: Tensor, truth: Tensor, size: int) -> Tensor:
+    """Error (B,) in px at the corner of a template of ``size`` px: that of x and y plus that of theta there."""
+    error = pose - truth
+    corner: Tensor = error[:, :2].norm(dim=-1) + error[:, 2].abs() * size / math.sqrt(2)
+    return corner
+
+
+def sampler_errors(noise: float, count: int, samplers: Sequence[str], tick: Callable[[], None]) -> dict[str, Tensor]:
+    """Sorted errors px of x and y of the templates that the default method finds, by sampler; both frames have
+    ``noise`` grey levels."""
+    both, view = pairs(count, JUMP, TURN), camera(noise_sigma=noise)
+    first, frames = view.capture(scene(), both.first, seed=SEED), view.capture(scene(), both.second, seed=SEED + 1)
+    template, start = Cut(MIDDLE, MIDDLE).template(first), MIDDLE.expand_as(both.truth)
+    result = {}
+    for name in samplers:
+        pose = METHODS["linear"].start(template, start, name).track(frames)
+        error = errors(pose, both.truth)[:, :2].norm(dim=-1)
+        result[name] = error[error < FOUND].sort().values
+    tick()
+    return result

@@ -1,0 +1,1 @@
+"""Two records of one motion, their calibration, and curves through them."""

@@ -1,0 +1,1 @@
+"""From a scene and its motion to frames: light, optics, sensor, sequences."""

@@ -1,0 +1,1 @@
+"""Scenes: analytic, so that their truth needs no interpolation."""

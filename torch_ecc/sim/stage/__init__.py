@@ -1,0 +1,1 @@
+"""Stages, their actuators, sensors and vibration, and the microscope over them."""

@@ -1,0 +1,1 @@
+"""The tracker: the only state, from frame to frame."""
