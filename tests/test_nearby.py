@@ -14,7 +14,7 @@ from torch_ecc.core.pose import compose
 from torch_ecc.core.settings import Settings
 from torch_ecc.search.nearby import FARTHEST, WIDEST, Nearby
 from torch_ecc.sim.scene.scene import Pads, PlaneWaves
-from torch_ecc.track.tracker import AT_ONCE, NEARBY_AT_ONCE
+from torch_ecc.track.recover import AT_ONCE, NEARBY_AT_ONCE
 
 FRAME = (240, 320)
 LIGHT = make_criterion("ecc", "linear")

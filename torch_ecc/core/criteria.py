@@ -7,19 +7,20 @@ matrix K, and the step is a simple function of K g.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ecc.core.pose import alike, library
-
-if TYPE_CHECKING:
-    from torch_ecc.core.reference import Reference
-
-ILLUMINATION = {"gain": 0, "linear": 2, "quadratic": 5}  # columns beside t itself
+ILLUMINATION: dict[
+    str, Callable[[Tensor], Tensor]
+] = {  # what the gain may vary by over [-1, 1]^2, (B, 2, N) -> (B, n, N)
+    "gain": lambda uv: uv[:, :0],
+    "linear": lambda uv: uv,
+    "quadratic": lambda uv: torch.cat((uv, uv * uv, uv[:, :1] * uv[:, 1:]), 1),
+}
 
 
 class Fit(NamedTuple):
@@ -29,6 +30,26 @@ class Fit(NamedTuple):
     gain: Tensor
 
 
+class Prepared(Protocol):
+    """What a criterion reads of a prepared template, see ``reference.Reference``."""
+
+    @property
+    def K(self) -> Tensor:
+        """(B, p, N)."""
+
+    @property
+    def signal(self) -> Tensor:
+        """[G, t], (B, 4, N)."""
+
+    @property
+    def weight(self) -> Tensor:
+        """(1 or B, N)."""
+
+    @property
+    def uv(self) -> Tensor:
+        """(B, 2, N)."""
+
+
 class Criterion(Protocol):
     """What the solver asks of a matching criterion; B templates, N pixels, p columns of which the first 3 are G."""
 
@@ -36,11 +57,11 @@ class Criterion(Protocol):
         """R (B, p, N) from ``signal`` = [G, t] (B, 4, N) and pixel positions ``uv`` (B, 2, N) scaled to [-1, 1]."""
         ...
 
-    def step(self, reference: Reference, g: Tensor) -> Tensor:
+    def step(self, reference: Prepared, g: Tensor) -> Tensor:
         """The increment (B, 3) that the sampled patches ``g`` (B, N) ask for; non-finite if they ask for none."""
         ...
 
-    def fit(self, reference: Reference, g: Tensor) -> Fit:
+    def fit(self, reference: Prepared, g: Tensor) -> Fit:
         """Residual and gain of the sampled patches ``g`` (B, N) under the criterion's model."""
         ...
 
@@ -71,28 +92,26 @@ class ECC:
         return torch.cat((signal[:, :3], contrast, torch.ones_like(t), t * self.light(uv)), 1)
 
     def light(self, uv: Tensor) -> Tensor:
-        """What the gain may vary by over the template: u, v, u^2, v^2, u v, (B, 0 | 2 | 5, N)."""
-        if self.illumination != "quadratic":
-            return uv[:, : ILLUMINATION[self.illumination]]
-        return torch.cat((uv, uv * uv, uv[:, :1] * uv[:, 1:]), 1)
+        """What the gain may vary by over the template, (B, n, N)."""
+        return ILLUMINATION[self.illumination](uv)
 
-    def step(self, reference: Reference, g: Tensor) -> Tensor:
+    def step(self, reference: Prepared, g: Tensor) -> Tensor:
         """b / a, (B, 3); infinite or NaN where the gain a is not positive."""
         g = g - g.narrow(1, 0, 1)  # K does not see a constant, but its sums stay small
         u = torch.bmm(reference.K.narrow(1, 0, 4), g.unsqueeze(2)).squeeze(2)
         increment, gain = torch.split_with_sizes(u, (3, 1), 1)
         return increment / gain.relu()
 
-    def fit(self, reference: Reference, g: Tensor) -> Fit:
+    def fit(self, reference: Prepared, g: Tensor) -> Fit:
         """g minus all columns; the gain is the coefficient a of t."""
         t, g = reference.signal.select(1, 3), g - g.narrow(1, 0, 1)
         u = torch.bmm(g.unsqueeze(1), reference.K.mT)
         slopes, gain = u.narrow(2, 0, 4), u[:, 0, 3:4]
         rest = torch.baddbmm(g.unsqueeze(1), slopes, reference.signal, alpha=-1).squeeze(1)
-        if self.illumination != "gain":
+        if u.shape[2] > 5:
             light = torch.bmm(u.narrow(2, 5, u.shape[2] - 5), self.light(reference.uv)).squeeze(1)
-            rest.addcmul_(light, t, value=-1)
-        return Fit(rest.sub_(u[:, 0, 4:5] - gain * (t.sum(-1, keepdim=True) / t.shape[1])), gain[:, 0])
+            rest = rest.addcmul(light, t, value=-1)
+        return Fit(rest - (u[:, 0, 4:5] - gain * t.mean(-1, keepdim=True)), gain[:, 0])
 
 
 @dataclass(frozen=True)
@@ -103,12 +122,12 @@ class PaperECC:
         """J, (B, 3, N)."""
         return signal[:, :3]
 
-    def step(self, reference: Reference, g: Tensor) -> Tensor:
+    def step(self, reference: Prepared, g: Tensor) -> Tensor:
         """(J^T J)^-1 J^T [ (dh / dg) (g - mean g) - (h - mean h) ], (B, 3): the sign of J's own increment."""
         residual, gain = self.fit(reference, g)
         return (reference.K @ residual[:, :, None])[:, :, 0] / gain[:, None]
 
-    def fit(self, reference: Reference, g: Tensor) -> Fit:
+    def fit(self, reference: Prepared, g: Tensor) -> Fit:
         """(g - mean g) - (dg / dh) (h - mean h), and dg / dh."""
         h0, dh = centred(reference.signal[:, 3], reference.weight)
         g0, dg = centred(g, reference.weight)
@@ -124,11 +143,11 @@ class SSD:
         """G, (B, 3, N)."""
         return signal[:, :3]
 
-    def step(self, reference: Reference, g: Tensor) -> Tensor:
+    def step(self, reference: Prepared, g: Tensor) -> Tensor:
         """pinv(G) (g - t), (B, 3)."""
         return (reference.K @ (g - reference.signal[:, 3])[:, :, None])[:, :, 0]
 
-    def fit(self, reference: Reference, g: Tensor) -> Fit:
+    def fit(self, reference: Prepared, g: Tensor) -> Fit:
         """g - t; the gain is 1."""
         return Fit(g - reference.signal[:, 3], torch.ones_like(g[:, 0]))
 
@@ -140,27 +159,24 @@ def centred(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return rest, (rest * rest * weight).sum(-1).sqrt()
 
 
-@np.errstate(all="ignore")
-def safe_inverse(matrix: Any) -> tuple[Any, Any]:
+def safe_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Inverse (B, n, n), zero where ``matrix`` is singular to float32, and whether it is regular, (B,) bool.
 
-    Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude. Tensors or
-    numpy arrays.
+    Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude.
     """
-    xp = library(matrix)
-    diagonal = xp.diagonal(matrix, 0, -2, -1)
-    scale = abs(diagonal).clip(1e-30) ** -0.5
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    scale = diagonal.abs().clamp(min=1e-30).rsqrt()
     scale = scale[:, :, None] * scale[:, None, :]
-    unit = matrix * scale
-    if unit.shape[-1] == 3:  # the adjugate, where LAPACK would take longer to begin
-        twice = xp.concatenate((unit, unit), 1)
-        twice = xp.concatenate((twice, twice), 2)
-        minors = twice[:, 1:4, 1:4] * twice[:, 2:5, 2:5] - twice[:, 1:4, 2:5] * twice[:, 2:5, 1:4]
-        inverse = xp.swapaxes(minors, 1, 2) / (unit[:, :1] * minors[:, :1]).sum(-1)[:, :, None]
-    else:
-        inverse = alike(torch.linalg.inv_ex(torch.as_tensor(unit))[0], matrix)
-    regular = (abs(inverse).sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
-    return xp.where(regular[:, None, None], inverse * scale, 0.0), regular
+    inverse = torch.linalg.inv_ex(matrix * scale)[0]
+    regular = (inverse.abs().sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
+    return torch.where(regular[:, None, None], inverse * scale, 0.0), regular
+
+
+CRITERIA: dict[str, Callable[[str], Criterion]] = {  # by name, of an illumination
+    "ecc": ECC,
+    "ecc_paper": lambda _: PaperECC(),
+    "ssd": lambda _: SSD(),
+}
 
 
 def make_criterion(criterion: str | Criterion, illumination: str = "linear") -> Criterion:
@@ -169,7 +185,7 @@ def make_criterion(criterion: str | Criterion, illumination: str = "linear") -> 
         if isinstance(criterion, type) or not all(hasattr(criterion, name) for name in ("columns", "step", "fit")):
             raise ValueError(f"criterion: expected a name or an object with columns, step and fit, got {criterion!r}")
         return criterion
-    known: dict[str, Criterion] = {"ecc": ECC(illumination), "ecc_paper": PaperECC(), "ssd": SSD()}
-    if criterion not in known:
-        raise ValueError(f"criterion: expected one of {list(known)} or an object, got {criterion!r}")
-    return known[criterion]
+    if criterion not in CRITERIA:
+        raise ValueError(f"criterion: expected one of {list(CRITERIA)} or an object, got {criterion!r}")
+    ECC(illumination)  # a wrong word is told whatever the criterion
+    return CRITERIA[criterion](illumination)

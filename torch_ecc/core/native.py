@@ -1,6 +1,6 @@
-"""The native path on a CPU: the solve of ``align.solve`` as one C++ operator, compiled on first use and cached.
+"""The native engine on a CPU: the loop of ``solver`` as one C++ operator, compiled on first use and cached.
 
-The torch path stays the reference; both give the same poses to 1e-4 px. Sources: ``csrc``. One compilation takes some
+The torch page stays the reference; both give the same poses to 1e-4 px. Sources: ``csrc``. One compilation takes some
 ten seconds, says so on stderr, and serves this version of torch and this kind of CPU from then on.
 """
 
@@ -14,24 +14,34 @@ import subprocess
 import sys
 import tempfile
 import warnings
-import weakref
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_ecc.core.criteria import ECC, ILLUMINATION, SSD, Criterion, PaperECC
-from torch_ecc.core.estimate import Estimate
-from torch_ecc.core.reference import Reference
+from torch_ecc.core import packed, reference, sampling, solver
+from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
+from torch_ecc.core.reference import Moments, Normal, Reference, normal_equations
 from torch_ecc.core.settings import Settings
+from torch_ecc.core.solver import Solution
 
 SOURCES = Path(__file__).parent / "csrc"
 DEGREE = {"bilinear": 1, "bspline3": 3, "bspline5": 5}
-CODE: dict[type[Criterion], int] = {SSD: -1, PaperECC: -2}  # beside ECC's number of light columns
+LIGHT = {"gain": 0, "linear": 2, "quadratic": 5}  # light columns of ECC
+CODE: dict[type[Criterion], int] = {SSD: -1, PaperECC: -2}
 DTYPES = (torch.uint8, torch.uint16, torch.float32)
-_packed: dict[int, tuple[weakref.ref[Tensor], tuple[object, ...], Tensor]] = {}  # by the id of K
+CONSTANTS = {  # of the Python modules, for the C++
+    "ECC_MOST": packed.MOST,
+    "ECC_BLOCK": reference.BLOCK,
+    "ECC_LEVELS": reference.LEVELS,
+    "ECC_ROUNDING": sampling.ROUNDING,
+    **{
+        f"ECC_{name}": getattr(solver, name)
+        for name in ("COARSE_TOLERANCE", "SECANT_RANGE", "LARGEST_SCALE", "LONGEST_STEP", "FLAT")
+    },
+}
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.
 MATHS = ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"]
 INSTRUCTIONS = {
@@ -40,64 +50,46 @@ INSTRUCTIONS = {
 }
 
 
-class Packed(NamedTuple):
-    """What the operators are called with: the templates (B, bytes) as the C++ reads them, and the settings."""
-
-    templates: Tensor
-    degree: int
-    max_iterations: int
-    tolerance: float
-    min_score: float
-
-
-def takes(image: Tensor) -> bool:
-    """Whether the operators read such an image."""
-    return image.dtype in DTYPES and image.device.type == "cpu"
+def takes(reference: Reference, image: Tensor, settings: Settings) -> bool:
+    """Whether the engine solves this: a built-in criterion and sampler, an image on the CPU in one of ``DTYPES``."""
+    return (
+        settings.backend != "torch"
+        and image.dtype in DTYPES
+        and image.device.type == "cpu"
+        and reference.place.radius.dtype == torch.float64  # float32 where it was prepared on Apple's MPS
+        and settings.interpolation in DEGREE
+        and _code(reference.criterion) is not None
+        and load(settings.backend == "native")
+    )
 
 
-def packed(reference: Reference, settings: Settings) -> Packed | None:
-    """Templates and settings for the operators; None if another path is asked for or needed."""
-    serves = type(reference.criterion) in (ECC, SSD, PaperECC) and reference.K.device.type == "cpu"
-    serves = serves and reference.radius.dtype == torch.float64  # float32 where it was prepared on Apple's MPS
-    if settings.backend == "torch" or not serves or not load(settings.backend == "native"):
-        return None
-    degree = DEGREE[settings.interpolation]
-    return Packed(_pack(reference), degree, settings.max_iterations, settings.tolerance, settings.min_score)
+def _code(criterion: Criterion) -> int | None:
+    """What the C++ calls a criterion: the number of light columns, or one of ``CODE``; None if it does not know it."""
+    return LIGHT.get(criterion.illumination) if type(criterion) is ECC else CODE.get(type(criterion))
 
 
-def solve(templates: Packed, image: Tensor, pose: Tensor) -> Estimate:
-    """Estimate of B templates in (B or 1, 1, H, W) of one of DTYPES, from poses (B, 3); some are left out.
-
-    Those have status -1: at the frame's border, where pixels drop out of sight, the torch path is needed.
-    """
-    return Estimate(*torch.ops.torch_ecc.solve.default(image, templates.templates, pose, *templates[1:]))
-
-
-def track(
-    templates: Packed, image: Tensor, state: list[Tensor], *, hold: bool, search: bool
-) -> tuple[Estimate, list[Tensor]]:
-    """One frame of a Tracker of one level: its estimate and the next ``state`` = [pose, velocity, start, score,
-    tracked, doubted]. The state is empty and the estimate that of ``solve`` if there are some to ``search`` for, or
-    some left out."""
-    operator = torch.ops.torch_ecc.track.default
-    fields = operator(image, templates.templates, state, *templates[1:], hold, search)
-    count = len(Estimate._fields)
-    return Estimate(*fields[:count]), fields[count:]
+def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
+    """Poses of B templates in (B or 1, 1, H, W) of one of ``DTYPES`` from ``start`` (B, 3) on, as of ``solver.solve``."""
+    code, degree = _code(reference.criterion), DEGREE[settings.interpolation]
+    *values, partial, moments = operator()(
+        image, start, *reference.packed, code, degree, settings.max_iterations, settings.tolerance
+    )
+    return Solution(*values, _visible(reference, partial, moments) if len(partial) else reference.normal)
 
 
-def _pack(reference: Reference) -> Tensor:
-    """16-bit images (B, bytes) of the templates, made once for as long as the reference lives."""
-    rest = tuple(v for v in reference if v is not reference.K)  # what holds K, as K_sparse too, would keep it alive
-    key = id(reference.K)
-    known = _packed.get(key)
-    if known is not None and known[0]() is reference.K and [*map(id, known[1])] == [*map(id, rest)]:
-        return known[2]
-    criterion = reference.criterion
-    code = ILLUMINATION[criterion.illumination] if isinstance(criterion, ECC) else CODE[type(criterion)]
-    made: Tensor = torch.ops.torch_ecc.pack.default(list(reference[1:]), code)
-    forget = _packed.pop  # a module's names are gone when the interpreter ends
-    _packed[key] = weakref.ref(reference.K, lambda _: forget(key, None)), rest, made
-    return made
+def _visible(reference: Reference, index: Tensor, moments: Tensor) -> Normal:
+    """The normal equations with those of the templates at ``index`` (n,) made anew from ``moments`` (n, ...)."""
+    most, columns = packed.MOST, reference.K.shape[1]
+    count, *matrices, gram, noise = moments.split((1, most**2, most**2, 16, 8), 1)
+    square = (matrix.view(-1, most, most)[:, :columns, :columns] for matrix in matrices)
+    anew = normal_equations(Moments(count[:, 0], *square, gram.view(-1, 4, 4), noise.view(-1, 2, 4)))
+    return Normal(*(old.index_copy(0, index, new) for old, new in zip(reference.normal, anew, strict=True)))
+
+
+@cache
+def operator() -> Any:
+    """The operator itself, which takes its time to be found."""
+    return torch.ops.torch_ecc.solve.default
 
 
 @lru_cache(maxsize=2)
@@ -107,28 +99,29 @@ def load(wanted: bool) -> bool:
     try:
         if compiler is None:
             raise OSError("no C++ compiler is found; CXX names one")
-        torch.ops.load_library(str(library(compiler)))
+        torch.ops.load_library(str(build(compiler)))
     except (OSError, RuntimeError, subprocess.SubprocessError) as error:
         if wanted or compiler is not None:
             reason = str(getattr(error, "stderr", None) or error).strip().splitlines()[0]
-            warnings.warn(f"torch_ecc: no native path, the slower torch path serves ({reason})", stacklevel=2)
+            warnings.warn(f"torch_ecc: no native engine, the slower torch page serves ({reason})", stacklevel=2)
         return False
     return True
 
 
-def library(compiler: str) -> Path:
+def build(compiler: str) -> Path:
     """The compiled operator in the user's cache folder, made if it is not there. Raises OSError, SubprocessError."""
     sources = sorted(SOURCES.iterdir())
     instructions = INSTRUCTIONS.get(torch.backends.cpu.get_cpu_capability(), [])
     flags = ["-O3", "-std=c++20", "-shared", "-fPIC", *MATHS, *instructions]
     flags += ["-undefined", "dynamic_lookup"] if sys.platform == "darwin" else ["-fopenmp"]
     flags.append(f"-D_GLIBCXX_USE_CXX11_ABI={int(torch.compiled_with_cxx11_abi())}")
+    flags += [f"-D{name}={value!r}" for name, value in CONSTANTS.items()]
     parts = [torch.__version__, sys.platform, compiler, *flags, *(source.read_text() for source in sources)]
     name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torch_ecc"
     target = folder / f"native-{name}.so"
     if not target.is_file():
-        print("torch_ecc: compiling the native CPU path, once (some 10 s) ...", file=sys.stderr, flush=True)
+        print("torch_ecc: compiling the native engine, once (some 10 s) ...", file=sys.stderr, flush=True)
         folder.mkdir(parents=True, exist_ok=True)
         home = Path(torch.__file__).parent
         include = [f"-I{home / 'include'}", f"-I{home / 'include' / 'torch' / 'csrc' / 'api' / 'include'}"]

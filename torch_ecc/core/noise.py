@@ -23,7 +23,7 @@ def template_noise(gray: Tensor, kept: Tensor) -> Tensor:
     return torch.maximum(noise_level(gray, kept), LEAST_NOISE * contrast)
 
 
-def texture_share(gradient: Tensor, noise: Tensor) -> Tensor:
+def wiener_weight(gradient: Tensor, noise: Tensor) -> Tensor:
     """How much of the blurred ``gradient`` (B, 2, h, w) is texture, not ``noise`` (B,), near each pixel: (B, 1, h, w).
 
     The factor S / (S + N / 2) that makes the scatter of two equally noisy images least, from the gradient's power
@@ -35,30 +35,32 @@ def texture_share(gradient: Tensor, noise: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=1)
+@torch.inference_mode(False)
 def noise_response() -> tuple[float, float]:
     """Of the x derivative of white noise of unit variance: raw times blurred, and blurred squared, on average."""
-    impulse = torch.zeros(1, 1, 33, 33)
+    impulse = torch.zeros(1, 1, 33, 33, dtype=torch.float32, device="cpu")
     impulse[..., 16, 16] = 1.0
     raw, blurred = gradients(impulse)[:, 0], gradients(blur(impulse, INSTRUMENT_BLUR))[:, 0]
     return float((raw * blurred).sum()), float((blurred * blurred).sum())
 
 
-def noise_slope(local: Tensor, weight: Tensor) -> Tensor:
-    """Sum over pixels ``local`` (B, 2, N) of w (dW/dp)^T dW/dp, (B, 3, 3): Z W G^T's shape if gradients are noise."""
-    x, y = local.unbind(1)
-    moments = (weight.expand_as(x), weight * x, weight * y, weight * (x * x + y * y))
-    n, wx, wy, wr = (moment.sum(-1) for moment in moments)
+def errors_in_variables(sums: Tensor) -> Tensor:
+    """Sum over pixels of q (dW/dp)^T dW/dp from their sums (B, 4) of q {1, x, y, x^2 + y^2}: (B, 3, 3).
+
+    What gradients that are white noise would leave in Z W G^T.
+    """
+    n, x, y, square = sums.unbind(-1)
     zero = torch.zeros_like(n)
-    return torch.stack((n, zero, wy, zero, n, -wx, wy, -wx, wr), -1).reshape(-1, 3, 3)
+    return torch.stack((n, zero, y, zero, n, -x, y, -x, square), -1).reshape(-1, 3, 3)
 
 
-def largest_share(slope: Tensor, inflation: Tensor) -> Tensor:
-    """Largest eigenvalue of slope^-1 inflation, (B,), infinite where the slope is singular.
+def largest_eigenvalue(bread: Tensor, bias: Tensor) -> Tensor:
+    """Largest generalised eigenvalue: of bread^-1 bias, (B,), infinite where the bread is singular.
 
     By a high power of the matrix, to 7 % from above, which an eigenvalue solver would not do without synchronising.
     """
-    inverse, regular = safe_inverse(slope)
-    share = inverse @ inflation
+    inverse, regular = safe_inverse(bread)
+    share = inverse @ bias
     scale = share.abs().amax((-2, -1), keepdim=True).clamp(min=1e-30)
     power = torch.linalg.matrix_power(share / scale, 16).diagonal(dim1=-2, dim2=-1).sum(-1)
     return torch.where(regular & (power > 0), power.clamp(min=0) ** (1 / 16) * scale[:, 0, 0], torch.inf)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import plain
 from torch_ecc.core.criteria import Criterion, make_criterion
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.pose import pose_dtype
@@ -59,7 +60,11 @@ def locate_patches(where: str, frame: Tensor, centers: Centers, size: Size, mask
         raise ValueError(
             f"{where}: template {r} ({w}x{h} px around x={x:g}, y={y:g}) must lie in the frame of {width}x{height} px"
         )
-    kept = torch.ones(len(place), 1, h, w) if mask is None else as_mask(where, mask, len(place), (h, w))
+    kept = (
+        torch.ones(len(place), 1, h, w, dtype=frame.dtype, device=frame.device)
+        if mask is None
+        else as_mask(where, mask, len(place), (h, w))
+    )
     return Patches(place, corner, (h, w), kept.to(frame.device))
 
 
@@ -71,8 +76,17 @@ def as_size(where: str, size: Size) -> tuple[int, int]:
     return int(pair[0]), int(pair[1])
 
 
-def cut(frame: Tensor, patches: Patches, criterion: Criterion) -> Reference:
-    """Prepare the templates at ``patches`` with what surrounds them, so that their borders have true gradients."""
+class Crop(NamedTuple):
+    """What ``prepare`` is called with: ``template`` (R, 1, h, w) with what surrounds it, its ``mask`` (R, 1, h, w) and
+    ``centre`` (R, 2)."""
+
+    template: Tensor
+    mask: Tensor
+    centre: Tensor
+
+
+def crop(frame: Tensor, patches: Patches) -> Crop:
+    """The templates at ``patches`` with what surrounds them, so that their borders have true gradients."""
     h, w = patches.size
     wide = pad(frame, MARGIN)
     x = patches.corner[:, :1] + torch.arange(w + 2 * MARGIN, device=frame.device)
@@ -80,10 +94,17 @@ def cut(frame: Tensor, patches: Patches, criterion: Criterion) -> Reference:
     which = torch.arange(len(frame), device=frame.device)[:, None, None]
     template = wide[which, 0, y[:, :, None], x[:, None, :]][:, None]
     mask = torch.nn.functional.pad(patches.mask, (MARGIN,) * 4)
-    middle = patches.corner + patches.corner.new_tensor((w - 1, h - 1)) / 2
-    return prepare(template, criterion=criterion, mask=mask, centre=patches.centers - middle)
+    middle = patches.corner + patches.centers.new_tensor((w - 1, h - 1)) / 2
+    return Crop(template, mask, patches.centers - middle)
 
 
+def cut(frame: Tensor, patches: Patches, criterion: Criterion) -> Reference:
+    """Prepare the templates at ``patches``."""
+    template, mask, centre = crop(frame, patches)
+    return prepare(template, criterion=criterion, mask=mask, centre=centre)
+
+
+@plain
 @torch.no_grad()
 def texture(
     frame: Tensor,
@@ -106,10 +127,12 @@ def texture(
     gray = as_gray("texture", "frame", frame)
     patches = locate_patches("texture", gray, centers, size, mask)
     reference = cut(gray, patches, make_criterion(criterion))
-    sigma = reference.noise if noise is None else torch.full_like(reference.noise, noise)
+    level = reference.noise.level
+    sigma = level if noise is None else torch.full_like(level, noise)
     rounding = 0.0 if require_tensor("texture", "frame", frame).is_floating_point() else QUANTISATION
     variance = sigma.to(patches.centers) ** 2 + rounding
     pose = torch.cat((patches.centers, torch.zeros_like(patches.centers[:, :1])), 1)
-    covariance, fixed = pose_covariance(reference, variance, torch.ones_like(variance), pose)
+    one = torch.ones_like(variance)
+    covariance, observable = pose_covariance(reference, reference.normal, variance, one, pose)
     predicted = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    return torch.where(fixed[:, None], predicted, float("inf"))
+    return torch.where(observable[:, None], predicted, torch.inf)

@@ -16,16 +16,13 @@ Conventions of the whole package, written here once:
 from __future__ import annotations
 
 from math import tau
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
     from kornia.geometry.liegroup import Se2
-
-Array = TypeVar("Array", Tensor, "np.ndarray[Any, Any]")
 
 
 def pose_dtype(device: torch.device | str) -> torch.dtype:
@@ -33,24 +30,10 @@ def pose_dtype(device: torch.device | str) -> torch.dtype:
     return torch.float32 if torch.device(device).type == "mps" else torch.float64
 
 
-def library(array: Any) -> Any:
-    """torch or numpy, whichever ``array`` is of: what they have in common serves ``rotation`` and ``retract``."""
-    return torch if isinstance(array, Tensor) else np
-
-
-def alike(values: Any, array: Any) -> Any:
-    """``values`` in the library and the dtype of ``array``."""
-    if isinstance(array, Tensor):
-        return values.to(array.dtype)
-    return (values.numpy() if isinstance(values, Tensor) else values).astype(array.dtype, copy=False)
-
-
-def rotation(theta: Array) -> Array:
+def rotation(theta: Tensor) -> Tensor:
     """Rotation block of eq. (2): (...) -> (..., 2, 2)."""
-    xp, angle = library(theta), theta[..., None]
-    c, s = xp.cos(angle), xp.sin(angle)
-    turn: Array = xp.concatenate((c, s, -s, c), -1).reshape(*theta.shape, 2, 2)
-    return turn
+    c, s = theta.cos(), theta.sin()
+    return torch.stack((c, s, -s, c), -1).unflatten(-1, (2, 2))
 
 
 def matrix(pose: Tensor) -> Tensor:
@@ -74,26 +57,32 @@ def transform(pose: Tensor, points: Tensor) -> Tensor:
     return points @ rotation(pose[..., 2]).mT + pose[..., None, :2]
 
 
-def compose(a: Array, b: Array) -> Array:
+def compose(a: Tensor, b: Tensor) -> Tensor:
     """W(a) o W(b), first b and then a: (..., 3), (..., 3) -> (..., 3). Angles add, so turns are kept."""
     t = a[..., :2] + (rotation(a[..., 2]) @ b[..., :2, None])[..., 0]
-    pose: Array = library(a).concatenate((t, a[..., 2:] + b[..., 2:]), -1)
-    return pose
+    return torch.cat((t, a[..., 2:] + b[..., 2:]), -1)
 
 
-def inverse(pose: Array) -> Array:
+def inverse(pose: Tensor) -> Tensor:
     """The pose of W(p)^-1: (..., 3) -> (..., 3)."""
     t = -(rotation(-pose[..., 2]) @ pose[..., :2, None])[..., 0]
-    back: Array = library(pose).concatenate((t, -pose[..., 2:]), -1)
-    return back
+    return torch.cat((t, -pose[..., 2:]), -1)
 
 
-def retract(pose: Array, increment: Array) -> Array:
-    """W(p) o W(dp)^-1, the inverse compositional update (eq. 10) in closed form: (B, 3), (B, 3) -> (B, 3)."""
+def retract(pose: Tensor, increment: Tensor) -> Tensor:
+    """W(p) o W(dp)^-1, the inverse compositional update (eq. 10) in closed form: (..., 3), (..., 3) -> (..., 3)."""
     theta = pose[..., 2:] - increment[..., 2:]
     t = pose[..., :2] - (rotation(theta[..., 0]) @ increment[..., :2, None])[..., 0]
-    moved: Array = library(pose).concatenate((t, theta), -1)
-    return moved
+    return torch.cat((t, theta), -1)
+
+
+def ahead(pose: Tensor, step: Tensor) -> Tensor:
+    """``pose`` = last + ``step`` after one more such step in the moving body's own axes, (..., 3), (..., 3) -> (..., 3).
+
+    W(pose) o W(last)^-1 o W(pose), exact for a constant turn about any point: the step turns by its own angle.
+    """
+    turned = (rotation(step[..., 2]) @ step[..., :2, None])[..., 0]
+    return pose + torch.cat((turned, step[..., 2:]), -1)
 
 
 def unwrap(theta: Tensor, reference: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ def pyramid(reference: Reference, levels: int) -> list[Reference]:
         if min(half.shape[-2:]) < SMALLEST_COARSE or not bool(enough):
             break
         middle = half.new_tensor((half.shape[-1] - 1, half.shape[-2] - 1)) / 2
-        centre = (references[-1].centre - corner) / 2 - middle
+        centre = (references[-1].place.centre - corner) / 2 - middle
         try:
             references.append(prepare(half, criterion=reference.criterion, mask=kept, centre=centre))
         except ValueError:  # texture finer than this level: one single grey level is left
@@ -33,11 +33,12 @@ def pyramid(reference: Reference, levels: int) -> list[Reference]:
 def as_images(reference: Reference) -> tuple[Tensor, Tensor, Tensor]:
     """Template and weights as images (B, 1, h, w), zero where nothing counts, and the place (2,) of their pixel (0, 0)
     relative to the middle of the template array."""
-    t, corner = reference.signal[:, 3], reference.box[:2, 0]
-    w, h = (reference.box[:2, 2] - corner + 1).round().long().tolist()
-    column, row = (reference.pixels[:2] - corner[:, None]).round().long()
+    grid = reference.grid
+    t, corner = reference.signal[:, 3], grid.box[:2, 0]
+    w, h = (grid.box[:2, 2] - corner + 1).round().long().tolist()
+    column, row = (grid.pixels[:2] - corner[:, None]).round().long()
     images = t.new_zeros(2, len(t), 1, h, w)
-    weight = reference.weight.expand_as(t)
+    weight = reference.weight
     images[:, :, 0, row, column] = torch.stack((torch.where(weight > 0, t, 0.0), weight))
     return images[0], images[1], corner
 

@@ -18,135 +18,184 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import cached_property
-from itertools import chain, repeat
-from typing import NamedTuple
+from itertools import chain
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import plain
 from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.noise import (
     INSTRUMENT_BLUR,
-    largest_share,
+    errors_in_variables,
+    largest_eigenvalue,
     noise_response,
-    noise_slope,
     template_noise,
-    texture_share,
+    wiener_weight,
 )
-from torch_ecc.core.pose import pose_dtype
-from torch_ecc.core.sampling import aliasing, blur, gradients, on_host, pad
+from torch_ecc.core.pose import pose_dtype, rotation
+from torch_ecc.core.sampling import SAMPLERS, aliasing, blur, gradients, pad
 
-ALIASING = ("bilinear", "bspline3")  # samplers whose own error counts; that of bspline5 does not
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
 ENOUGH = 1500  # pixels of a template tell well where to go; the first iterations leave out others in x and y
 SPARSEST = 4  # px between those that are kept
-BLOCK = 6  # px: side of the blocks over which residuals are taken to cling together
+BLOCK = 6  # px: side of the blocks over which the last look at a patch is summed
 PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which takes some 600 bytes on the way
 SMALLEST = 5  # px: side of the smallest template
-PIXELWISE = ("pixels", "signal", "instrument", "trust", "weight")  # beside K; what the sparse pixels have too
-NUMBERS = (  # what is not per pixel
-    *("box", "centre", "radius", "noise", "alias", "slope", "spread", "inflation", "spread_noise", "noise_share"),
-    *("moments", "reach"),
-)
-SHARED = ("criterion", "pixels", "box", "block", "block_sizes", "sparse", "pixels_sparse")  # by all templates
+LEVELS = 2**15 - 1  # a template is rounded to so many steps on either side: an engine may hold it in 16 bits
+
+Fields = TypeVar("Fields", bound=tuple[Any, ...])
 
 
-class _Fields(NamedTuple):
-    criterion: Criterion
+class Grid(NamedTuple):
+    """Where the pixels of all templates lie: ``pixels`` (3, N), homogeneous, relative to the middle of the template
+    array; ``box`` (3, 4), the corners of their bounding box; ``block`` (N,), the number of the block that a pixel is
+    in, of ``blocks`` = (rows, columns) of them, of which ``occupied`` hold a pixel."""
+
     pixels: Tensor
     box: Tensor
     block: Tensor
-    block_sizes: Tensor
+    blocks: tuple[int, int]
+    occupied: int
+
+
+class Place(NamedTuple):
+    """What the poses of B templates speak of: ``centre`` (B, 2), the point x' = 0 in the grid's coordinates; ``radius``
+    (B,) px from there to the farthest pixel; ``lever`` (B, 3): by how many px an increment of 1 in x, y, theta moves
+    that pixel; ``unit`` (B, 2, 3) takes pixels to positions about the centre over half the bounding box."""
+
     centre: Tensor
     radius: Tensor
-    noise: Tensor
+    lever: Tensor
+    unit: Tensor
+
+
+class Columns(NamedTuple):
+    """Per pixel: ``signal`` and ``instrument`` (B, 4, N) = [G, t], raw and blurred, the blurred G times ``wiener``
+    (B, N), see ``noise.wiener_weight``; ``weight`` (B, N). The slopes and t of the instrument and of the signal count
+    in ``unit`` (B, 4) grey levels (per px), and t from ``level`` (B, 2): whole numbers of at most ``LEVELS``."""
+
     signal: Tensor
     instrument: Tensor
-    trust: Tensor
+    wiener: Tensor
     weight: Tensor
-    alias: Tensor
-    K: Tensor
-    slope: Tensor
-    spread: Tensor
-    inflation: Tensor
-    spread_noise: Tensor
-    noise_share: Tensor
-    sparse: Tensor
-    K_sparse: Tensor
-    pixels_sparse: Tensor
-    signal_sparse: Tensor
-    instrument_sparse: Tensor
-    trust_sparse: Tensor
-    weight_sparse: Tensor
-    moments: Tensor
     unit: Tensor
-    reach: Tensor
+    level: Tensor
 
 
-class Reference(_Fields):
-    """B prepared templates of N pixels under a criterion of p columns.
+class Moments(NamedTuple):
+    """Sums over the pixels that count, of which all else that depends on the weights is made: their ``count`` (B,),
+    ``normal`` = Z W R^T and ``power`` = Z W (Z W)^T (B, p, p), ``gram`` (B, 4, 4) of {1, u, v, t less its mean} under
+    W, and ``noise`` (B, 2, 4) of q {1, x, y, x^2 + y^2} for q the weights times ``wiener``, and for q^2."""
 
-    ``pixels`` (3, N) homogeneous pixel positions relative to the middle of the template array; ``box`` (3, 4) the
-    corners of their bounding box; ``block`` (N,) the number of the block of neighbours that a pixel is in and
-    ``block_sizes`` (blocks,) how many there are in each; ``centre`` (B, 2) the point x' = 0 in the pixels' coordinates;
-    ``radius`` (B,) px from there to the farthest pixel; ``noise`` (B,) upper estimate of the template's noise, grey
-    levels; ``signal`` and ``instrument`` (B, 4, N) = [G, t] raw and blurred, the blurred G times ``trust`` (B, N), see
-    ``texture_share``; ``weight`` (1 or B, N); ``K`` (B, p, N).
+    count: Tensor
+    normal: Tensor
+    power: Tensor
+    gram: Tensor
+    noise: Tensor
 
-    For the covariance: ``alias`` (B, 2, 3, 2), how far aliasing along the template's x and y shifts the pose at most,
-    with the samplers ``ALIASING``; each (B, 3, 3) ``slope`` = Z W G^T and ``spread`` = Z W (Z W)^T, both off the other
-    columns, ``inflation`` and ``spread_noise``, what white noise of unit variance in the template adds to each;
-    ``noise_share`` (B,) is the largest part of ``slope`` that such noise can be, in any direction.
 
-    For the first iterations: ``sparse`` (n,), pixels on a coarser grid; ``K_sparse`` (B, p, n), made from them alone,
-    and what else ``PIXELWISE`` names, there. ``moments`` (B, 7): how many pixels count, the sum of their weights, their
-    weighted mean, the weighted norm of what is left of them, and the square sums of the first rows of K. ``unit``
-    (B, 2, 3) takes pixels to positions about the centre over half the bounding box; ``reach`` (B, 3): by how many px
-    an increment of 1 in x, y, theta moves the farthest pixel.
+class Normal(NamedTuple):
+    """The normal equations of B templates: ``inverse`` (B, p, p) of Z W R^T, zero where it is singular; for the sandwich
+    covariance, each (B, 3, 3), ``bread`` = Z W G^T and ``meat`` = Z W (Z W)^T, both off the other columns, and what
+    white noise of unit variance in the template adds to them (errors in variables), ``bread_bias`` and ``meat_bias``;
+    ``noise_share`` (B,): the largest part of the bread that such noise can be, in any direction; ``white`` (B, 3): the
+    square sums of the first rows of K; ``total`` (B,) of the weights, and ``freedom`` (B,), the share of it that fitted
+    columns leave; ``energy`` (B,) the weighted square sum of t off its mean; ``gram`` as in ``Moments``."""
+
+    inverse: Tensor
+    bread: Tensor
+    meat: Tensor
+    bread_bias: Tensor
+    meat_bias: Tensor
+    noise_share: Tensor
+    white: Tensor
+    total: Tensor
+    freedom: Tensor
+    energy: Tensor
+    gram: Tensor
+
+
+class Noise(NamedTuple):
+    """``level`` (B,): upper estimate of the template's noise, grey levels; ``alias`` (B, samplers, 3, 2): how far
+    aliasing along the template's x and y shifts the pose at most, with each sampler whose own error counts."""
+
+    level: Tensor
+    alias: Tensor
+
+
+class _Groups(NamedTuple):
+    criterion: Criterion
+    grid: Grid
+    place: Place
+    columns: Columns
+    K: Tensor
+    normal: Normal
+    noise: Noise
+    coarse: Any  # Reference | None
+
+
+class Reference(_Groups):
+    """B prepared templates of N pixels under a criterion of p columns: ``K`` (B, p, N), and what else is constant.
+
+    ``coarse``: the same templates on a coarser grid, with a K of their own, for the first iterations; None where all
+    pixels are few enough.
     """
 
     @property
+    def signal(self) -> Tensor:
+        """[G, t], (B, 4, N)."""
+        return self.columns.signal
+
+    @property
+    def weight(self) -> Tensor:
+        """(B, N)."""
+        return self.columns.weight
+
+    @property
     def uv(self) -> Tensor:
-        """The light columns' coordinates: pixel positions in ``unit``, (B, 2, N)."""
-        return self.unit @ self.pixels
-
-    @property
-    def thin(self) -> Reference:
-        """The same templates on their ``sparse`` pixels: all that it takes to come near."""
-        return self if len(self.sparse) == self.K.shape[-1] else self._thin
-
-    @property
-    def at_hand(self) -> Reference:
-        """The same with its ``NUMBERS`` in the poses' dtype, where the host may look at them as numpy arrays."""
-        return self._at_hand if isinstance(self.radius, Tensor) else self
+        """The light columns' coordinates: pixel positions in ``Place.unit``, (B, 2, N)."""
+        return self.place.unit @ self.grid.pixels
 
     @cached_property
-    def _thin(self) -> Reference:
-        return self._replace(**{name: getattr(self, f"{name}_sparse") for name in ("K", *PIXELWISE)})
+    def packed(self) -> Any:
+        """The templates in 16 bits, for a compiled engine: made once for as long as the reference lives."""
+        from torch_ecc.core.packed import pack  # which needs to know what a reference is
 
-    @cached_property
-    def _at_hand(self) -> Reference:
-        numbers = {name: getattr(self, name).to(self.radius.dtype) for name in NUMBERS}
-        return self._replace(**{name: on_host(value) for name, value in numbers.items()})
+        return pack(self)
+
+    def warps(self, pose: Tensor) -> Tensor:
+        """2x3 warps (B, 2, 3) that take the grid's pixels to the frame at poses (B, 3): eq. (2) about the centre."""
+        turn = rotation(pose[:, 2])
+        return torch.cat((turn, pose[:, :2, None] - turn @ self.place.centre.to(pose.dtype)[:, :, None]), 2)
 
     def select(self, index: Tensor | slice) -> Reference:
         """The reference of the templates at ``index`` (n,); of a slice without a copy."""
         if isinstance(index, Tensor) and index.tolist() == list(range(len(self.K))):
             return self
-        shared = _shared(len(self.weight))
-        return Reference(*(v if name in shared else v[index] for name, v in self._asdict().items()))
+        return _each(lambda v: v[index], self)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
         """``function`` applied to every tensor, ``lambda t: t.to(device)`` for instance."""
-        return Reference(self.criterion, *(function(v) for v in self[1:]))
+        return _each(function, self, shared=True)
 
 
-def _shared(weights: int) -> tuple[str, ...]:
-    """The names of the fields that all templates have in common; the weights too if there is but one set of them."""
-    return SHARED if weights > 1 else (*SHARED, "weight", "weight_sparse")
+def _each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared: bool = False) -> Fields:
+    """``function`` of the tensors at the same place in nested records; of what all templates share, a Grid, only if
+    ``shared``: else it is that of the first, as is whatever is no tensor."""
+    values = []
+    for value, *more in zip(first, *others, strict=True):
+        if isinstance(value, Tensor):
+            value = function(value, *more)
+        elif isinstance(value, tuple) and hasattr(value, "_fields") and (shared or not isinstance(value, Grid)):
+            value = _each(function, value, *more, shared=shared)
+        values.append(value)
+    return type(first)(*values)
 
 
+@plain
 @torch.no_grad()
 def prepare(
     template: Tensor,
@@ -173,92 +222,91 @@ def prepare(
     if centre.shape != (len(gray), 2):
         raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
     some, used = max(PIXELS_AT_ONCE // gray[0].numel(), 1), (kept > 0).any(0).flatten()
-    parts = zip(gray.split(some), kept.split(some) if len(kept) > 1 else repeat(kept), centre.split(some), strict=False)
-    return _joined((_prepared(chosen, *part, used) for part in parts), len(gray), _shared(len(kept)))
+    parts = zip(gray.split(some), kept.expand(len(gray), -1, -1, -1).split(some), centre.split(some), strict=True)
+    return _joined((_prepared(chosen, *part, used) for part in parts), len(gray))
 
 
-def _joined(parts: Iterator[Reference], count: int, shared: tuple[str, ...]) -> Reference:
-    """One reference of ``count`` templates from those of some after the other, of which never more than one is there;
-    the names of the fields that they have in common."""
+def _joined(parts: Iterator[Reference], count: int) -> Reference:
+    """One reference of ``count`` templates from those of some after the other, of which never more than one is there."""
     first, done = next(parts), 0
     if len(first.K) == count:
         return first
-    own = {name: v.new_empty(count, *v.shape[1:]) for name, v in first._asdict().items() if name not in shared}
+    whole = _each(lambda v: v.new_empty(count, *v.shape[1:]), first)
     for part in chain([first], parts):
-        for name, values in own.items():
-            values[done : done + len(part.K)] = getattr(part, name)
-        done += len(part.K)
-    return first._replace(**own)
-
-
-def _prepared(criterion: Criterion, gray: Tensor, kept: Tensor, centre: Tensor, used: Tensor) -> Reference:
-    """``prepare`` of grey templates (B, 1, h, w) with weights (1 or B, 1, h, w), of which the pixels ``used`` (h w,)
-    count in any template, about ``centre`` (B, 2)."""
-    wide = pad(gray, MARGIN)
-    inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
-    soft, noise = blur(wide, INSTRUMENT_BLUR), template_noise(gray, kept)
-    slopes = gradients(soft)
-    images = torch.cat((gradients(wide), wide, slopes, soft, texture_share(slopes, noise)), 1)[inner]
-    reference = _assemble(criterion, images, noise, kept, centre, used)
-    wrong = torch.cat([aliasing(wide, name) for name in ALIASING], 1)[inner].flatten(2)[:, :, used]
-    wrong = wrong.unflatten(1, (len(ALIASING), 2))
-    return reference._replace(alias=(reference.K[:, None, :3] @ wrong.mT).to(reference.radius.dtype))
+        here = slice(done, done + len(part.K))
+        _each(lambda w, p, here=here: w[here].copy_(p), whole, part)
+        done = here.stop
+    return whole
 
 
 def _refuse_flat(gray: Tensor, kept: Tensor) -> None:
-    infinity = gray.new_tensor(float("inf"))
-    highest = torch.where(kept > 0, gray, -infinity).amax((1, 2, 3))
-    lowest = torch.where(kept > 0, gray, infinity).amin((1, 2, 3))
+    highest = torch.where(kept > 0, gray, -torch.inf).amax((1, 2, 3))
+    lowest = torch.where(kept > 0, gray, torch.inf).amin((1, 2, 3))
     flat = (highest <= lowest).nonzero().flatten().tolist()
     if flat:
         raise ValueError(f"prepare: template must have texture, got one single grey level in template {flat}")
 
 
-def _assemble(
-    criterion: Criterion, images: Tensor, noise: Tensor, kept: Tensor, centre: Tensor, used: Tensor
-) -> Reference:
-    """Reference from ``images`` (B, 7, h, w): d/dx, d/dy and t, the same blurred, and what of the blurred slopes is
-    texture; the template's ``noise`` (B,) and weights (1 or B, 1, h, w)."""
-    h, w = images.shape[-2:]
-    y, x = torch.meshgrid(*(torch.arange(n, device=images.device) - (n - 1) / 2 for n in (h, w)), indexing="ij")
-    pixels = torch.stack((x.flatten()[used], y.flatten()[used], torch.ones_like(x.flatten()[used])))
-    (left, top), (right, bottom) = pixels[:2].amin(-1).tolist(), pixels[:2].amax(-1).tolist()
-    box = pixels.new_tensor([[left, right, right, left], [top, top, bottom, bottom], [1, 1, 1, 1]])
+def _prepared(criterion: Criterion, gray: Tensor, kept: Tensor, centre: Tensor, used: Tensor) -> Reference:
+    """``prepare`` of grey templates (B, 1, h, w) with weights (B, 1, h, w), of which the pixels ``used`` (h w,) count
+    in any template, about ``centre`` (B, 2)."""
+
+    def counted(images: Tensor) -> Tensor:  # (B, k, h, w) to (B, k, N)
+        return images[:, :, MARGIN:-MARGIN, MARGIN:-MARGIN].flatten(2)[:, :, used]
+
+    grid, wide, noise = _grid(used, gray), pad(gray, MARGIN), template_noise(gray, kept)
+    soft = blur(wide, INSTRUMENT_BLUR)
+    slopes = gradients(soft)
+    wiener = counted(wiener_weight(slopes, noise))
     weight = kept.flatten(1)[:, used]
-    local = pixels[:2] - centre[:, :, None]
-    sharp, soft, trust = images.flatten(2)[:, :, used].split((3, 3, 1), 1)
-    signal, instrument = _steepest_descent(sharp, local), _steepest_descent(soft, local)
-    instrument = torch.cat((instrument[:, :3] * trust, instrument[:, 3:]), 1)
-    radius = (local.square().sum(1) * (weight > 0)).amax(-1).sqrt().to(pose_dtype(images.device))
-    nothing, no_alias = radius.new_zeros(len(images), 3, 3), radius.new_zeros(len(images), len(ALIASING), 3, 2)
-    column, row = ((pixels[:2] - box[:2, :1]) / BLOCK).long()
-    _, block, block_sizes = torch.unique(row * w + column, return_inverse=True, return_counts=True)
-    constants = (
-        pixels,
-        box,
-        block,
-        block_sizes,
-        centre,
-        radius,
-        noise,
-        signal,
-        instrument,
-        trust[:, 0],
-        weight,
-        no_alias,
-    )
-    column, row = (pixels[:2] - box[:2, :1]).long()
-    step = min(max(math.isqrt(pixels.shape[1] // ENOUGH), 1), SPARSEST)
-    sparse = ((column % step == 0) & (row % step == 0)).nonzero()[:, 0]
-    kept_here = sparse if step > 1 else sparse[:0]  # all of them are the template itself
-    few = [v[..., kept_here] for v in (pixels, signal, instrument, trust[:, 0], weight)]
-    half = (box[:2, 2] - box[:2, 0]).clamp(min=1.0)[:, None] / 2
-    unit = torch.cat((torch.eye(2).to(half).expand(len(images), 2, 2), -centre[:, :, None]), -1) / half
-    reach = torch.stack((torch.ones_like(radius), torch.ones_like(radius), radius), -1)
-    rest = (signal, nothing, nothing, nothing, nothing, radius, sparse, signal, *few, radius, unit, reach)
-    reference = reweigh(Reference(criterion, *constants, *rest), weight > 0)
-    thin = reference.thin
-    return reference._replace(K_sparse=reference.K if thin is reference else reweigh(thin, thin.weight > 0).K)
+    place = _place(grid, centre, weight)
+    columns = _columns(
+        grid.pixels[:2] - centre[:, :, None],
+        torch.cat((counted(slopes) * wiener, counted(soft)), 1),
+        torch.cat((counted(gradients(wide)), counted(wide)), 1),
+    )._replace(wiener=wiener[:, 0], weight=weight)
+    reference = _solved(criterion, grid, place, columns, Noise(noise, noise))
+    wrong = torch.stack([counted(aliasing(wide, name)) for name, kernel in SAMPLERS.items() if kernel.aliases], 1)
+    alias = (reference.K[:, None, :3] @ wrong.mT).to(place.radius.dtype)
+    reference = reference._replace(noise=Noise(noise, alias))
+    return reference._replace(coarse=_coarser(reference))
+
+
+def _grid(used: Tensor, image: Tensor) -> Grid:
+    """The grid of the pixels ``used`` (h w,) of an ``image`` (B, 1, h, w)."""
+    axes = (torch.arange(n, device=image.device, dtype=image.dtype) - (n - 1) / 2 for n in image.shape[-2:])
+    y, x = (axis.flatten()[used] for axis in torch.meshgrid(*axes, indexing="ij"))
+    (left, right), (top, bottom) = ((float(v.min()), float(v.max())) for v in (x, y))
+    box = image.new_tensor([[left, right, right, left], [top, top, bottom, bottom], [1, 1, 1, 1]])
+    column, row = ((x - left) / BLOCK).long(), ((y - top) / BLOCK).long()
+    blocks = (int(bottom - top) // BLOCK + 1, int(right - left) // BLOCK + 1)
+    block = row * blocks[1] + column
+    return Grid(torch.stack((x, y, torch.ones_like(x))), box, block, blocks, int((torch.bincount(block) > 0).sum()))
+
+
+def _place(grid: Grid, centre: Tensor, weight: Tensor) -> Place:
+    local = grid.pixels[:2] - centre[:, :, None]
+    radius = (local.square().sum(1) * (weight > 0)).amax(-1).sqrt().to(pose_dtype(centre.device))
+    lever = torch.stack((torch.ones_like(radius), torch.ones_like(radius), radius), -1)
+    half = (grid.box[:2, 2] - grid.box[:2, 0]).clamp(min=1.0)[:, None] / 2
+    one = torch.eye(2, dtype=half.dtype, device=half.device).expand(len(centre), 2, 2)
+    return Place(centre, radius, lever, torch.cat((one, -centre[:, :, None]), -1) / half)
+
+
+def _columns(local: Tensor, soft: Tensor, sharp: Tensor) -> Columns:
+    """Rounded columns from [d/dx, d/dy, t] (B, 3, N), blurred and raw, at ``local`` (B, 2, N) about the centre."""
+    images, units, levels = [], [], []
+    for image in (soft, sharp):
+        level = image[:, 2:].mean(-1, keepdim=True)
+        parts = image[:, :2], image[:, 2:] - level
+        unit = [part.abs().amax((1, 2), keepdim=True).clamp(min=1e-30) / LEVELS for part in parts]
+        slopes, t = (unit * (part / unit).round() for part, unit in zip(parts, unit, strict=True))
+        images.append(_steepest_descent(torch.cat((slopes, t + level), 1), local))
+        units += unit
+        levels.append(level)
+    signal, instrument = images[1], images[0]
+    nothing = signal[:, 0]
+    return Columns(signal, instrument, nothing, nothing, torch.cat(units, 1)[..., 0], torch.cat(levels, 1)[..., 0])
 
 
 def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:
@@ -267,33 +315,70 @@ def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:
     return torch.stack((gx, gy, gx * local[:, 1] - gy * local[:, 0], t), 1)
 
 
-def reweigh(reference: Reference, seen: Tensor) -> Reference:
-    """The reference of which only the pixels ``seen`` (1 or B, N), bool, count: new weight, K and covariance terms."""
-    weight = reference.weight * seen
-    uv = reference.uv
-    R, Z = (reference.criterion.columns(v, uv) for v in (reference.signal, reference.instrument))
-    ZW = Z * weight[:, None]
-    t, dtype = reference.signal[:, 3], reference.radius.dtype
-    total = weight.sum(-1, keepdim=True)
-    level = (t * weight).sum(-1, keepdim=True) / total.clamp(min=1e-30)
-    count, spread = (weight > 0).sum(-1, keepdim=True), (weight * (t - level) ** 2).sum(-1, keepdim=True).sqrt()
-    normal, power = (ZW @ R.mT).to(dtype), (ZW @ ZW.mT).to(dtype)
-    inverse, regular = safe_inverse(normal)
-    others, _ = safe_inverse(normal[:, 3:, 3:])
-    project = torch.eye(3, dtype=dtype, device=weight.device).expand(len(R), 3, 3)
-    project = torch.cat((project, -normal[:, :3, 3:] @ others), -1)
-    slope = (project @ normal)[:, :, :3] * regular[:, None, None]
-    local = reference.pixels[:2] - reference.centre[:, :, None]
-    inflation = noise_slope(local, weight * reference.trust).to(dtype) * noise_response()[0]
-    K = (inverse @ ZW.to(dtype)).to(R.dtype)
-    moments = [v.expand_as(level).to(dtype) for v in (count, total, level, spread)]
-    return reference._replace(
-        weight=weight,
-        K=K,
-        slope=slope,
-        spread=project @ power @ project.mT,
-        inflation=inflation,
-        spread_noise=noise_slope(local, (weight * reference.trust).square()).to(dtype) * noise_response()[1],
-        noise_share=largest_share(slope, inflation),
-        moments=torch.cat([*moments, K[:, :3].square().sum(-1).to(dtype)], 1),
+def _coarser(reference: Reference) -> Reference | None:
+    """The pixels on a grid coarser by a whole number, as many as tell well where to go; None if that is all of them."""
+    grid, columns = reference.grid, reference.columns
+    step = min(max(math.isqrt(grid.pixels.shape[1] // ENOUGH), 1), SPARSEST)
+    if step == 1:
+        return None
+    column, row = (grid.pixels[:2] - grid.box[:2, :1]).long()
+    kept = ((column % step == 0) & (row % step == 0)).nonzero()[:, 0]
+    grid = grid._replace(pixels=grid.pixels[:, kept], block=grid.block[kept])
+    images = (v[..., kept] for v in columns[:4])
+    subsampled = Columns(*images, columns.unit, columns.level)
+    return _solved(reference.criterion, grid, reference.place, subsampled, reference.noise)
+
+
+def _solved(criterion: Criterion, grid: Grid, place: Place, columns: Columns, noise: Noise) -> Reference:
+    """A reference with its normal equations."""
+    nothing: Any = None
+    return reweigh(Reference(criterion, grid, place, columns, columns.weight, nothing, noise, None), columns.weight > 0)
+
+
+def reweigh(reference: Reference, visible: Tensor) -> Reference:
+    """The reference of which only the pixels ``visible`` (B, N), bool, count: new weight, K and normal equations."""
+    columns = reference.columns._replace(weight=reference.columns.weight * visible)
+    R, Z = (reference.criterion.columns(v, reference.uv) for v in (columns.signal, columns.instrument))
+    ZW, dtype = Z * columns.weight[:, None], reference.place.radius.dtype
+    t = columns.signal[:, 3:]
+    shape = torch.cat((torch.ones_like(t), reference.uv, t - t.mean(-1, keepdim=True)), 1).to(dtype)
+    local = reference.grid.pixels[:2] - reference.place.centre[:, :, None]
+    arms = torch.cat((torch.ones_like(t), local, local.square().sum(1, keepdim=True)), 1)
+    q = (columns.weight * columns.wiener)[:, None]
+    sums = Moments(
+        (columns.weight > 0).sum(-1).to(dtype),
+        (ZW @ R.mT).to(dtype),
+        (ZW @ ZW.mT).to(dtype),
+        (shape * columns.weight[:, None]) @ shape.mT,
+        (torch.cat((q, q * q), 1) @ arms.mT).to(dtype),
+    )
+    normal = normal_equations(sums)
+    K = (normal.inverse @ ZW.to(dtype)).to(R.dtype)
+    return reference._replace(columns=columns, K=K, normal=normal)
+
+
+def normal_equations(sums: Moments) -> Normal:
+    """What follows from the sums over the pixels that count."""
+    inverse, regular = safe_inverse(sums.normal)
+    others, _ = safe_inverse(sums.normal[:, 3:, 3:])
+    one = torch.eye(3, dtype=inverse.dtype, device=inverse.device).expand(len(inverse), 3, 3)
+    project = torch.cat((one, -sums.normal[:, :3, 3:] @ others), -1)
+    bread = (project @ sums.normal)[:, :, :3] * regular[:, None, None]
+    bread_bias, meat_bias = (
+        errors_in_variables(q) * response for q, response in zip(sums.noise.unbind(1), noise_response(), strict=True)
+    )
+    total, along = sums.gram[:, 0, 0], sums.gram[:, 0, 3]
+    columns = inverse.shape[-1]
+    return Normal(
+        inverse=inverse,
+        bread=bread,
+        meat=project @ sums.power @ project.mT,
+        bread_bias=bread_bias,
+        meat_bias=meat_bias,
+        noise_share=largest_eigenvalue(bread, bread_bias),
+        white=((inverse @ sums.power) * inverse).sum(-1)[:, :3],
+        total=total,
+        freedom=total * (sums.count - columns).clamp(min=1) / sums.count.clamp(min=1),
+        energy=(sums.gram[:, 3, 3] - along * along / total.clamp(min=1e-30)).clamp(min=0),
+        gram=sums.gram,
     )

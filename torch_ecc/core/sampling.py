@@ -6,68 +6,115 @@ pixel centres at integers, and a warp is a 2x3 matrix that takes homogeneous tem
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache, reduce
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
-from torch_ecc.core.pose import alike, pose_dtype
+from torch_ecc.core.pose import pose_dtype
 
-# px around a patch: in which bilinear iterations may move it; and that its B-spline still feels, of degree 3 and 5:
-REACH = {1: 16, 3: 7, 5: 10}  # 0.27 ** 7 and 0.43 ** 10 are 1e-4 and 2e-4 of the border's contrast
-LOOKED_AT = {"cpu"}  # devices that let the host see a value without waiting for it
-TAPS = {3: (4 / 6, 1 / 6), 5: (66 / 120, 26 / 120, 1 / 120)}  # centred B-splines at 0, 1, 2
-SLOPE = {3: (0.0, 1 / 2), 5: (0.0, 10 / 24, 1 / 24)}  # minus their derivatives there
-# Variance of white noise after sampling, mean over all sub-pixel phases: a sampler smooths what lies between pixels.
-NOISE_GAIN = {"bilinear": 4 / 9, "bspline3": 0.7643, "bspline5": 0.8427}
+MARGIN_KEPT = 3  # px: a window serves until a patch comes nearer to its border
+ROUNDING = 1e-6  # px: a pixel on the frame's outermost row is in sight, however its place was rounded
+
+Pairs = list[tuple[int, Tensor, Tensor]]  # of taps: the first one's offset, the sum of both weights, the second weight
+
+
+def _linear(f: Tensor) -> Pairs:
+    return [(0, torch.ones_like(f), f)]
+
+
+def _cubic(f: Tensor) -> Pairs:
+    r, square = 1 - f, f * f
+    left, right = (r * r).mul_(r).mul_(1 / 6), (square * f).mul_(1 / 6)
+    high = square.add_(f).mul_(0.5).sub_(right, alpha=2).add_(1 / 6)
+    low = 1 - high
+    return [(-1, low, low - left), (1, high, right)]
+
+
+def _quintic(f: Tensor) -> Pairs:
+    r = 1 - f
+    w = [
+        r**5 / 120,
+        ((1 + r) ** 5 - 6 * r**5) / 120,
+        ((2 + r) ** 5 - 6 * (1 + r) ** 5 + 15 * r**5) / 120,
+        ((2 + f) ** 5 - 6 * (1 + f) ** 5 + 15 * f**5) / 120,
+        ((1 + f) ** 5 - 6 * f**5) / 120,
+        f**5 / 120,
+    ]
+    return [(k - 2, w[k] + w[k + 1], w[k + 1]) for k in (0, 2, 4)]
+
+
+class Kernel(NamedTuple):
+    """An interpolation: how neighbouring pixels make a value between them. To add one, add it to ``SAMPLERS``.
+
+    ``pairs``: of its non-negative taps around a point with fractional part f, any shape; ``taps``: the kernel at 0, 1,
+    2 ... px, if it is not the identity there and images are prefiltered; ``radius``: px beyond which pixels bear on a
+    value by less than 2e-4 of their contrast; ``noise_gain``: variance of white noise after sampling, mean over all
+    sub-pixel phases (a sampler smooths what lies between pixels); ``aliases``: whether its own error counts.
+    """
+
+    pairs: Callable[[Tensor], Pairs]
+    taps: tuple[float, ...] = (1.0,)
+    radius: int = 1
+    noise_gain: float = 1.0
+    aliases: bool = True
+
+    @property
+    def ring(self) -> int:
+        """Taps before the pixel that a point lies behind."""
+        return len(self.taps) - 1
+
+
+SAMPLERS = {
+    "bilinear": Kernel(_linear, noise_gain=4 / 9),
+    "bspline3": Kernel(_cubic, (4 / 6, 1 / 6), 7, 0.7643),  # 0.27^7 and 0.43^10: the inverse filters' decay
+    "bspline5": Kernel(_quintic, (66 / 120, 26 / 120, 1 / 120), 10, 0.8427, aliases=False),
+}
+SLOPE = (0.0, 1 / 2)  # of the cubic B-spline at 0 and 1 px, but for the sign
 
 
 class Sampler(NamedTuple):
-    """Values of images between their pixels, bilinear (``degree`` 1) or by the interpolating B-spline (3, 5).
+    """Values of images between their pixels.
 
-    ``values`` (I, 1, h, w), the image or the B-spline's coefficients, I = 1 (shared by all, not copied) or one per
-    template. ``origin`` (I, 2, 3): what to subtract from a warp to count from value (0, 0), so that coordinates stay
-    small and float32 holds 1e-5 px. ``edge``: the frame's size (h, w) if templates may reach beyond it.
+    ``values`` (I, 1, h, w): the image or the coefficients of its B-spline, I = 1 (shared by all, not copied) or one
+    per template. ``origin`` (I, 2), float64: the position of value (0, 0), so that coordinates count from there, stay
+    small, and float32 holds 1e-5 px.
     """
 
     values: Tensor
-    degree: int = 1
-    origin: Tensor | None = None
-    edge: tuple[int, int] | None = None
+    kernel: Kernel
+    origin: Tensor
 
     @staticmethod
-    def of(image: Tensor, degree: int, corner: Tensor | None = None) -> Sampler:
+    def of(image: Tensor, interpolation: str = "bilinear", corner: Tensor | None = None) -> Sampler:
         """Of an ``image`` (I, 1, h, w) whose pixel (0, 0) lies at ``corner`` (I, 2), by default the origin."""
-        ring, corner = degree // 2, torch.zeros(1, 2, device=image.device) if corner is None else corner
-        values = prefilter(image, degree, ring) if ring else image
-        return Sampler(values, degree, F.pad((corner - ring).unsqueeze(-1), (2, 0)))
+        kernel = SAMPLERS[interpolation]
+        if corner is None:
+            corner = torch.zeros(len(image), 2, dtype=pose_dtype(image.device), device=image.device)
+        values = prefilter(image, interpolation, kernel.ring) if kernel.ring else image
+        return Sampler(values, kernel, corner - kernel.ring)
 
-    def __call__(self, warp: Any, pixels: Tensor) -> Tensor:
+    def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
         """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside, its border repeats."""
-        local, in_torch = self._local(warp), isinstance(warp, Tensor) or self.degree > 1
-        scale, shift = _unit_square(*self.values.shape[-2:], self.values.device, in_torch)
-        if self.degree == 1:
-            return _lookup(self.values, _points(local * scale + shift, pixels))
-        return self._spline(_points(local, pixels), scale.float())
-
-    def _local(self, warp: Any) -> Any:
-        """``warp`` (B, 2, 3) to coordinates that count from the origin."""
-        return warp if self.origin is None else warp - alike(self.origin, warp)
+        turn, shift = warp[:, :, :2], warp[:, :, 2:] - self.origin[:, :, None]
+        scale = _to_unit(*self.values.shape[-2:], self.values.device)
+        if self.kernel.ring == 0:
+            return _lookup(self.values, _points(torch.cat((turn * scale, shift * scale - 1), 2), pixels))
+        return self._spline(_points(torch.cat((turn, shift), 2), pixels), scale.to(pixels.dtype))
 
     def _spline(self, points: Tensor, scale: Tensor) -> Tensor:
         """Values (B, N) at ``points`` (B, 2, N).
 
-        A B-spline is non-negative, so each pair of neighbouring taps is one bilinear lookup at their centre of mass
-        (Ruijters et al., 2008): (degree + 1)^2 / 4 lookups instead of (degree + 1)^2 gathers.
+        Taps are non-negative, so each pair of neighbouring ones is one bilinear lookup at their centre of mass
+        (Ruijters et al., 2008): a quarter as many lookups as there are taps.
         """
         floor = points.floor()
-        pairs = _pairs(points.sub_(floor), self.degree)
+        pairs = self.kernel.pairs(points.sub_(floor))
         n = len(pairs)
         at = points.new_empty(len(points), 2 * n, points.shape[-1])  # x of each pair of columns, then y of each of rows
         for k, (first, total, second) in enumerate(pairs):
@@ -77,16 +124,17 @@ class Sampler(NamedTuple):
         rows = [[_lookup(self.values, at[:, i : n + j + 1 : n + j - i]) for i in range(n)] for j in range(n)]
         return _sum([_sum(row, wx) for row in rows], wy)
 
-    def covers(self, warp: Any, box: Any, margin: float) -> Any:
-        """Whether ``box`` (3, 4) at ``warp`` (B, 2, 3) lies ``margin`` px inside of what was sampled, (B,) bool."""
-        return inside(self._local(warp), box, self.values.shape[-2:], margin + self.degree // 2).all(-1)
-
     def select(self, index: Tensor) -> Sampler:
         """The sampler of some of the templates."""
-        if len(self.values) in (1, len(index)):
+        if len(self.values) == 1:
             return self
-        origin = self.origin[index] if self.origin is not None and len(self.origin) > 1 else self.origin
-        return self._replace(values=self.values[index], origin=origin)
+        return self._replace(values=self.values[index], origin=self.origin[index])
+
+    def covers(self, low: Tensor, high: Tensor) -> bool:
+        """Whether what lies between ``low`` and ``high`` (B, 2), px of the frame, was prefiltered."""
+        first = self.origin + self.kernel.ring
+        last = torch.stack((first[:, 0] + self.values.shape[-1], first[:, 1] + self.values.shape[-2]), 1)
+        return bool(((low >= first) & (high < last - 2 * self.kernel.ring)).all())
 
 
 def host_looks(device: torch.device) -> bool:
@@ -94,49 +142,46 @@ def host_looks(device: torch.device) -> bool:
 
     It decides nothing but what is left undone: iterations after convergence, pixels of the frame far from a template.
     """
-    return device.type in LOOKED_AT
+    return device.type == "cpu"
 
 
-def on_host(tensor: Tensor) -> Any:
-    """``tensor`` as numpy sees it, without a copy, where the host may look at it; itself elsewhere.
+def make_sampler(interpolation: str, image: Tensor, warp: Tensor, box: Tensor, last: Sampler | None = None) -> Sampler:
+    """The sampler of ``image`` (I, 1, H, W), float, around the patches ``warp`` (B, 2, 3) of the rectangle ``box``
+    (3, 4): the ``last`` one if it still serves.
 
-    A call of numpy on a few numbers takes a quarter of the time of torch's.
+    Only the neighbourhoods of the patches are prefiltered, unless so many share one image that all of it is less work;
+    on an accelerator always all of it.
     """
-    return tensor.numpy() if host_looks(tensor.device) else tensor
+    kernel, (h, w) = SAMPLERS[interpolation], image.shape[-2:]
+    if kernel.ring == 0 or not host_looks(image.device):
+        return last or Sampler.of(image, interpolation)
+    most = torch.tensor((w - 1, h - 1), dtype=warp.dtype, device=warp.device)
+    corners = warp @ box.to(warp.dtype)
+    low, high = corners.amin(-1), corners.amax(-1)
+    kept = [torch.minimum(v.clamp(min=0), most) for v in (low - MARGIN_KEPT, high + MARGIN_KEPT)]
+    if last is not None and (
+        last.values.shape[-2:] == (h + 2 * kernel.ring, w + 2 * kernel.ring) or last.covers(*kept)
+    ):
+        return last
+    low, high = low.nan_to_num().floor() - kernel.radius, high.nan_to_num().ceil() + kernel.radius
+    side = -(-(int((high - low).max()) + 1) // 8) * 8  # few different sizes, so that the prefilter matrices are reused
+    if side > min(h, w) or (len(image) == 1 and len(warp) * 2 * side**3 >= h * w * (h + w)):
+        return Sampler.of(image, interpolation)
+    low = torch.minimum(low.clamp(min=0), most - (side - 1))  # what lies beyond is not sampled
+    return Sampler.of(_crops(image, low.long(), side), interpolation, low)
 
 
-def make_sampler(interpolation: str, image: Tensor, warp: Any, box: Any) -> Sampler:
-    """The sampler of ``image`` (I, 1, H, W) around the patches ``warp`` (B, 2, 3) of the template rectangle.
-
-    ``box`` (3, 4): the rectangle's corners. Only the neighbourhoods of the patches are converted and prefiltered,
-    unless so many share one image that all of it is less work; on an accelerator always all of it.
-    """
-    degree, (h, w) = 1 if interpolation == "bilinear" else int(interpolation[-1]), image.shape[-2:]
-    if host_looks(image.device) and not (degree == 1 and image.dtype == torch.float32):
-        corners, reach = np.asarray(warp) @ np.asarray(box), REACH[degree]
-        low = np.floor(corners.min(-1)) - reach
-        extent = int((np.ceil(corners.max(-1)) + reach - low).max()) + 1
-        side = -(-extent // 8) * 8  # few different sizes, so that the prefilter matrices are reused
-        part, whole = (side * side, h * w) if degree == 1 else (2 * side**3, h * w * (h + w))
-        if side <= min(h, w) and (len(image) > 1 or len(warp) * part < whole):
-            low = low.clip(0, (w - side, h - side)).astype(int)  # what lies beyond is not sampled
-            return Sampler.of(_crop(image, low, side), degree, torch.from_numpy(low).double())
-    return Sampler.of(image.float(), degree)
+def inside(warp: Tensor, pixels: Tensor, size: Sequence[int]) -> Tensor:
+    """Which ``pixels`` (3, N) the ``warp`` (B, 2, 3) puts inside a frame (h, w): bool (B, N)."""
+    x, y = (warp @ pixels.to(warp.dtype)).unbind(1)
+    right, bottom = size[1] - 1 + ROUNDING, size[0] - 1 + ROUNDING
+    return (x >= -ROUNDING) & (x <= right) & (y >= -ROUNDING) & (y <= bottom)
 
 
-def inside(warp: Any, pixels: Any, size: Sequence[int], margin: float = 0.0) -> Any:
-    """Which ``pixels`` (3, N) the ``warp`` (B, 2, 3) puts at least ``margin`` px inside a frame (h, w): bool (B, N)."""
-    points = warp @ alike(pixels, warp)
-    x, y = points[:, 0], points[:, 1]
-    h, w = size
-    return (x >= margin) & (x <= w - 1 - margin) & (y >= margin) & (y <= h - 1 - margin)
-
-
-def _crop(image: Tensor, origin: Any, side: int) -> Tensor:
-    """Squares (B, 1, side, side), float, of ``image`` (1 or B, 1, H, W) from ``origin`` (B, 2) = (x, y), all inside."""
-    frames, side_by_side = image.detach().numpy()[:, 0], zip(cycle(range(len(image))), origin.tolist(), strict=False)
-    crops = np.stack([frames[b, y : y + side, x : x + side] for b, (x, y) in side_by_side])
-    return torch.from_numpy(crops.astype(np.float32))[:, None]
+def _crops(image: Tensor, corner: Tensor, side: int) -> Tensor:
+    """Squares (B, 1, side, side) of ``image`` (1 or B, 1, H, W) from ``corner`` (B, 2) = (x, y), all inside."""
+    frames = zip(cycle(range(len(image))), corner.tolist(), strict=False)
+    return torch.stack([image[b, :, y : y + side, x : x + side] for b, (x, y) in frames])
 
 
 def _mirror(index: Tensor, size: int) -> Tensor:
@@ -146,19 +191,16 @@ def _mirror(index: Tensor, size: int) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)
-def _unit_square(h: int, w: int, device: torch.device, in_torch: bool) -> tuple[Any, Any]:
-    """Scale (2, 1) and shift (2, 3) of warps from px to grid_sample's coordinates: -1 and 1 at the outer pixels."""
-    both = [[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]], [[0, 0, -1.0]] * 2
-    scale, shift = (torch.tensor(rows, dtype=pose_dtype(device), device=device) for rows in both)
-    return (scale, shift) if in_torch else (scale.numpy(), shift.numpy())
+@torch.inference_mode(False)  # what a cache keeps must serve outside inference mode too
+def _to_unit(h: int, w: int, device: torch.device) -> Tensor:
+    """What takes px from the first pixel to grid_sample's coordinates plus 1, which end at 2: (2, 1)."""
+    ends = [[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]]
+    return torch.tensor(ends, dtype=pose_dtype(device), device=device)
 
 
-def _points(warp: Any, pixels: Tensor) -> Tensor:
-    """Where the ``warp`` (B, 2, 3), a tensor or numpy array, takes ``pixels`` (3, N): (B, 2, N), float32."""
-    rows = warp.reshape(-1, 3)
-    rows = rows.to(pixels.dtype) if isinstance(rows, Tensor) else torch.from_numpy(rows.astype(np.float32))
-    return torch.mm(rows, pixels).view(len(warp), 2, -1)
+def _points(warp: Tensor, pixels: Tensor) -> Tensor:
+    """Where the ``warp`` (B, 2, 3) takes ``pixels`` (3, N): (B, 2, N), in the pixels' dtype."""
+    return torch.mm(warp.to(pixels.dtype).view(-1, 3), pixels).view(len(warp), 2, -1)
 
 
 def _lookup(image: Tensor, points: Tensor) -> Tensor:
@@ -175,64 +217,45 @@ def _sum(values: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
     return reduce(lambda total, pair: total.addcmul_(*pair), zip(values[1:], weights[1:], strict=True), values[0])
 
 
-def _pairs(f: Tensor, degree: int) -> list[tuple[int, Tensor, Tensor]]:
-    """Pairs of neighbouring taps around a point with fractional part ``f``, any shape: the first one's offset, the
-    sum of both weights and the second one's weight."""
-    r = 1 - f
-    if degree == 1:
-        return [(0, torch.ones_like(f), f)]
-    if degree == 3:
-        square = f * f
-        left, right = (r * r).mul_(r).mul_(1 / 6), (square * f).mul_(1 / 6)
-        high = square.add_(f).mul_(0.5).sub_(right, alpha=2).add_(1 / 6)
-        low = 1 - high
-        return [(-1, low, low - left), (1, high, right)]
-    w = [
-        r**5 / 120,
-        ((1 + r) ** 5 - 6 * r**5) / 120,
-        ((2 + r) ** 5 - 6 * (1 + r) ** 5 + 15 * r**5) / 120,
-        ((2 + f) ** 5 - 6 * (1 + f) ** 5 + 15 * f**5) / 120,
-        ((1 + f) ** 5 - 6 * f**5) / 120,
-        f**5 / 120,
-    ]
-    return [(k - 2, w[k] + w[k + 1], w[k + 1]) for k in (0, 2, 4)]
-
-
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _spline_matrices(n: int, degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Prefilter (n, n): samples to B-spline coefficients, mirrored at the border; and slope (n, n) at the samples."""
-    index = torch.arange(n)
-    taps, slope = torch.zeros(2, n, n, dtype=torch.float64)
-    for offset in range(-(degree // 2), degree // 2 + 1):
-        column = _mirror(index + offset, n)
-        taps[index, column] += TAPS[degree][abs(offset)]
-        slope[index, column] += SLOPE[degree][abs(offset)] * (1 if offset > 0 else -1)
-    filter_ = torch.linalg.inv(taps)
-    return filter_.float().to(device), (slope @ filter_).float().to(device)
+def _band(n: int, taps: tuple[float, ...], sign: int, device: torch.device) -> Tensor:
+    """Filter with ``taps`` at 0, 1, 2 ... px, odd about 0 for a ``sign`` of -1, mirrored at the border: (n, n)."""
+    index = torch.arange(n, device="cpu")
+    band = torch.zeros(n, n, dtype=torch.float64, device="cpu")
+    for offset in range(1 - len(taps), len(taps)):
+        band[index, _mirror(index + offset, n)] += taps[abs(offset)] * (1 if offset >= 0 else sign)
+    return band.to(device)
 
 
-def prefilter(image: Tensor, degree: int, ring: int = 0) -> Tensor:
+def prefilter(image: Tensor, interpolation: str, ring: int = 0) -> Tensor:
     """Coefficients of the interpolating B-spline of ``image`` (..., H, W), mirrored at its border (Unser, 1993), and
     ``ring`` more on every side, which repeat those inside: (..., H + 2 ring, W + 2 ring).
 
     Two products with a dense inverse: exact, and faster than a recursion, blocks or a 25-tap convolution in torch.
     """
-    rows, columns = (_prefilter_matrix(n, degree, ring, image.device) for n in image.shape[-2:])
+    rows, columns = (_prefilter_matrix(n, SAMPLERS[interpolation].taps, ring, image.device) for n in image.shape[-2:])
     return rows @ image @ columns.mT
 
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _prefilter_matrix(n: int, degree: int, ring: int, device: torch.device) -> Tensor:
-    index = _mirror(torch.arange(-ring, n + ring, device=device), n)
-    return _spline_matrices(n, degree, device)[0][index]
+def _prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, device: torch.device) -> Tensor:
+    inverse = torch.linalg.inv(_band(n, taps, 1, torch.device("cpu")))
+    return inverse[_mirror(torch.arange(-ring, n + ring, device="cpu"), n)].to(device, torch.float32)
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _slope_matrix(n: int, device: torch.device) -> Tensor:
+    cpu = torch.device("cpu")
+    slope = _band(n, SLOPE, -1, cpu) @ torch.linalg.inv(_band(n, SAMPLERS["bspline3"].taps, 1, cpu))
+    return slope.to(device, torch.float32)
 
 
 def gradients(image: Tensor) -> Tensor:
     """d/dx and d/dy at the pixels, (B, 1, H, W) -> (B, 2, H, W): the slope of the interpolating cubic B-spline."""
-    _, rows = _spline_matrices(image.shape[-2], 3, image.device)
-    _, columns = _spline_matrices(image.shape[-1], 3, image.device)
+    rows, columns = (_slope_matrix(n, image.device) for n in image.shape[-2:])
     return torch.cat((image @ columns.mT, rows @ image), 1)
 
 
@@ -246,19 +269,21 @@ def aliasing(image: Tensor, interpolation: str) -> Tensor:
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)
 def _alias(n: int, interpolation: str, device: torch.device) -> Tensor:
     """Samples of a signal to the error in them after it was sampled a quarter px off and interpolated back, (n, n)."""
-    exact, degree = _quarter(n, 5), 1 if interpolation == "bilinear" else int(interpolation[-1])
-    return ((_quarter(n, degree) - exact) @ exact.flip(0, 1)).to(device)
+    exact = _quarter(n, "bspline5")
+    return ((_quarter(n, interpolation) - exact) @ exact.flip(0, 1)).to(device)
 
 
-def _quarter(n: int, degree: int) -> Tensor:
-    """Samples to the values that a spline of ``degree`` 1, 3 or 5 finds a quarter px after them, (n, n)."""
-    index, f, taps = torch.arange(n), torch.tensor(0.25), torch.zeros(n, n)
-    for first, total, second in _pairs(f, degree):
+def _quarter(n: int, interpolation: str) -> Tensor:
+    """Samples to the values that an interpolation finds a quarter px after them, (n, n)."""
+    cpu, kernel = torch.device("cpu"), SAMPLERS[interpolation]
+    index, taps = torch.arange(n, device=cpu), torch.zeros(n, n, dtype=torch.float32, device=cpu)
+    for first, total, second in kernel.pairs(torch.tensor(0.25, dtype=torch.float32, device=cpu)):
         taps[index, _mirror(index + first, n)] += total - second
         taps[index, _mirror(index + first + 1, n)] += second
-    return taps if degree == 1 else taps @ _spline_matrices(n, degree, taps.device)[0]
+    return taps @ _prefilter_matrix(n, kernel.taps, 0, cpu) if kernel.ring else taps
 
 
 def pad(image: Tensor, margin: int) -> Tensor:
@@ -293,7 +318,7 @@ def noise_level(image: Tensor, kept: Tensor) -> Tensor:
     Median response to the difference of two Laplacians (Immerkaer, 1996), which cancels flat areas, ramps and edges
     along rows or columns; what fine texture leaves in it counts as noise.
     """
-    kernel = image.new_tensor([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])[None, None]
+    kernel = image.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])[None, None]
     response = F.conv2d(image, kernel).abs().flatten(1) / 6
     response = torch.where(kept[:, :, 1:-1, 1:-1].flatten(1) > 0, response, float("nan"))
     return response.nanmedian(-1).values.nan_to_num() / 0.6745

@@ -1,180 +1,167 @@
-"""The loop: batched inverse compositional Gauss-Newton for x, y and theta (paper, Algorithm 1, lines 7 to 10)."""
+"""The loop, on one page: batched inverse compositional Gauss-Newton for x, y and theta (Algorithm 1, lines 7 to 10).
+
+The whole solve in plain torch, on any device, for any criterion and sampler, inside the frame or across its border: the
+reference that every other engine (``native``) is measured against. An engine answers with a ``Solution``; what it is
+worth is judged in ``verdict``, once for all of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ecc.core.pose import Array, alike, library, retract, rotation
-from torch_ecc.core.reference import Reference, reweigh
+from torch_ecc.core.criteria import centred
+from torch_ecc.core.pose import retract
+from torch_ecc.core.reference import Normal, Reference, reweigh
 from torch_ecc.core.sampling import Sampler, host_looks, inside, make_sampler
 from torch_ecc.core.settings import Settings
 
 COARSE_TOLERANCE = 0.02  # px; the bilinear iterations only have to come near: their own bias is some 0.005 px
-EDGE = 4  # px: a template nearer than this to the frame's border may cross it while iterating
-SECANT_RANGE = 1.0  # px; steps beyond it are not stretched
-LARGEST_STRETCH = 5.0
+SECANT_RANGE = 1.0  # px; steps beyond it are not accelerated
+LARGEST_SCALE = 5.0  # of an accelerated step
 LONGEST_STEP = 0.2  # of the template's radius: a longer one left the range in which the linearisation means anything
+PIXELS_AT_ONCE = 2**18  # of templates that a CPU solves together, per thread, so that they stay in its cache
+FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
+
+
+class Solution(NamedTuple):
+    """What an engine answers with, of B templates: ``pose`` (B, 3); ``error`` (B,), the predicted remaining error in px
+    at the farthest pixel; ``iterations`` (B,); the patch's ``gain`` (B,); ``sums`` (B, 10, blocks) of its last look, in
+    every block of pixels, the rows of ``summed``; and the ``normal`` equations of the pixels that it then saw."""
+
+    pose: Tensor
+    error: Tensor
+    iterations: Tensor
+    gain: Tensor
+    sums: Tensor
+    normal: Normal
 
 
 class State(NamedTuple):
     """Of B templates: ``pose`` (B, 3), the last increment ``delta`` (B, 3) in px at the farthest pixel, its ``length``
-    (B,) and the ``factor`` (B,) that it was stretched by, the predicted remaining ``error`` (B,) in px there,
-    ``iterations`` (B,) and the last sampled ``patch`` (B, N), None before the first. On a CPU all but the patch are
-    numpy arrays while they are iterated."""
+    (B,) and the ``scale`` (B,) of the step taken, the predicted remaining ``error`` (B,) in px there, ``iterations``."""
 
-    pose: Any
-    delta: Any
-    length: Any
-    factor: Any
-    error: Any
-    iterations: Any
-    patch: Any
+    pose: Tensor
+    delta: Tensor
+    length: Tensor
+    scale: Tensor
+    error: Tensor
+    iterations: Tensor
 
     @staticmethod
-    def start(reference: Reference, pose: Any) -> State:
+    def start(pose: Tensor) -> State:
         """Before the first iteration."""
-        xp = library(pose)
-        one, count = xp.ones_like(pose[:, 0]), xp.zeros_like(pose[:, 0], dtype=xp.int64)
-        return State(pose, xp.zeros_like(pose), 0 * one, one, one * xp.inf, count, None)
-
-    def convert(self, function: Callable[[Any], Any]) -> State:
-        """The state in the other library, by ``Tensor.numpy`` or ``torch.from_numpy``."""
-        return State._make([*map(function, self[:-1]), self.patch])
-
-    def select(self, index: Tensor) -> State:
-        """The state of some of the templates."""
-        return self if len(index) == len(self.pose) else State(*(v[index] for v in self))
-
-    def merge(self, index: Tensor, part: State) -> State:
-        """This state with the templates at ``index`` replaced by ``part``."""
-        if len(index) == len(self.pose):
-            return part
-        return State(*(v.index_copy(0, index, p) for v, p in zip(self, part, strict=True)))
+        none = torch.zeros_like(pose[:, 0])
+        return State(pose, torch.zeros_like(pose), none, none + 1, none + inf, none.long())
 
 
-def warps(reference: Reference, pose: Array) -> Array:
-    """2x3 warps (B, 2, 3) that take ``reference.pixels`` to the frame: eq. (2) about the template's own centre."""
-    turn = rotation(pose[:, 2])
-    shift = pose[:, :2, None] - turn @ alike(reference.centre, pose)[:, :, None]
-    warp: Array = library(pose).concatenate((turn, shift), -1)
-    return warp
+def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
+    """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on. A CPU does some after the others."""
+    image, many = image.float(), len(start)
+    some = (
+        max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1) if host_looks(start.device) else many
+    )
+    if many <= some:
+        return solve_at_once(reference, image, start, settings)
+    parts = [slice(k, k + some) for k in range(0, many, some)]
+    views = [image if len(image) == 1 else image[part] for part in parts]
+    found = [solve_at_once(reference.select(p), v, start[p], settings) for p, v in zip(parts, views, strict=True)]
+    *values, normals = zip(*found, strict=True)
+    return Solution(*map(torch.cat, values), Normal(*map(torch.cat, zip(*normals, strict=True))))
 
 
-def gauss_newton(reference: Reference, sample: Sampler, state: State, tolerance: float) -> State:
-    """One iteration. Elements whose predicted error is below ``tolerance`` already stay as they are."""
-    xp, pose, busy = library(state.pose), state.pose, state.error > tolerance
-    warp = warps(reference, pose)
-    g = look(sample, warp, reference.pixels, state.patch, busy)  # I(W(p_k; x'))
-    if sample.edge is not None:
-        reference = reweigh(reference, torch.as_tensor(inside(warp, reference.pixels, sample.edge)))
-    increment, reach = alike(reference.criterion.step(reference, g), pose), alike(reference.reach, pose)  # eq. (9)
-    delta = increment * reach
-    length = norm(delta)
-    moving = (length < xp.inf) & busy  # NaN compares as not moving
-    factor, rate = secant(state, delta, length)
-    stretch = xp.minimum(factor, LONGEST_STEP * reach[:, 2] / length)
-    moved = retract(pose, xp.where(moving[:, None], increment * stretch[:, None], 0.0))  # eq. (10)
-    error = xp.where(moving, length * stretch * rate / (1 - rate), 0.0)
-    length, stretch = xp.where(moving, length, state.length), xp.where(moving, stretch, state.factor)
-    return State(moved, delta, length, stretch, error, state.iterations + moving, g)
+def solve_at_once(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
+    """Bilinear on few pixels first, to come near; then as is asked for. What the first stage leaves of the iterations
+    is the second one's."""
+    most, coarse, state = settings.max_iterations, reference.coarse or reference, State.start(start)
+    if most > 1 and not (settings.interpolation == "bilinear" and coarse is reference):
+        near = max(settings.tolerance, COARSE_TOLERANCE)
+        state, _, _ = iterate(coarse, image, "bilinear", state, near, max(most * 2 // 3, 1))
+    state, g, weighed = iterate(reference, image, settings.interpolation, state, settings.tolerance, most)
+    gain, sums = summed(weighed, g)
+    return Solution(state.pose, state.error, state.iterations, gain, sums, weighed.normal)
 
 
-def look(sample: Sampler, warp: Any, pixels: Tensor, patch: Tensor | None, busy: Any) -> Tensor:
-    """The patches (B, N) at ``warp`` (B, 2, 3); where the host knows who is ``busy`` (B,), the others are as before."""
-    if isinstance(busy, Tensor) or busy.all():
-        return sample(warp, pixels)
-    index, patch = busy.nonzero()[0], pixels.new_zeros(len(busy), pixels.shape[1]) if patch is None else patch
-    return patch.index_copy(0, torch.from_numpy(index), sample.select(index)(warp[index], pixels))
-
-
-def norm(vector: Any) -> Any:
-    """Length (B,) of vectors (B, n)."""
-    return (vector * vector).sum(-1) ** 0.5
-
-
-def secant(state: State, delta: Any, length: Any) -> tuple[Any, Any]:
-    """Stretch of an increment ``delta`` (B, 3) of the given ``length`` (B,), and the rate of convergence, (B,) each.
-
-    Noise in the template shortens every step by one factor, so that steps shrink in a geometric series. Two of them
-    tell its sum (the secant method on their common line). Only near the answer, where steps are such a series, and
-    within one stage: another sampler or other pixels have another answer, to which the first step is no part of it. Of
-    that step the earlier stage tells what it leaves: the share that its steps did not cover.
-    """
-    xp, last, first = library(delta), state.length, ~(state.error < inf)
-    rate = xp.where(last > 0, length / last, 0.5)
-    rate = xp.where(first & (state.factor > 1), 1 - 1 / state.factor, rate).clip(0.05, 0.95)
-    along = (state.delta * delta).sum(-1) / (last * last)  # = 1 - (last stretch) * (share that a step covers)
-    usable = (last < SECANT_RANGE) & (along < 0.9) & ~first
-    return xp.where(usable, (state.factor / (1 - along)).clip(1.0, LARGEST_STRETCH), 1.0), rate
-
-
-def iterate(reference: Reference, sample: Sampler, state: State, tolerance: float, budget: int) -> State:
-    """Gauss-Newton until every predicted error is below ``tolerance`` or ``budget`` iterations are spent.
+def iterate(
+    reference: Reference, image: Tensor, interpolation: str, state: State, tolerance: float, most: int
+) -> tuple[State, Tensor, Reference]:
+    """Gauss-Newton until every predicted error is below ``tolerance`` or ``most`` iterations are spent: the state, the
+    last patches (B, N), and the reference weighed by what was in sight of them.
 
     An accelerator does them all, so that the host need not know: what has converged is masked.
     """
-    state = state._replace(patch=None)
-    for _ in range(budget):
-        if host_looks(reference.K.device) and not (state.error > tolerance).any():
+    size, looks = (image.shape[-2], image.shape[-1]), host_looks(image.device)
+    state, g, sample, weighed = state._replace(error=torch.full_like(state.error, inf)), None, None, reference
+    for _ in range(most):
+        busy = (state.error > tolerance) & (state.iterations < most)
+        if looks and not busy.any():
             break
-        state = gauss_newton(reference, sample, state, tolerance)
-    return state if state.patch is not None else state._replace(patch=torch.zeros_like(reference.K[:, 0]))
+        warp = reference.warps(state.pose)
+        sample = make_sampler(interpolation, image, warp, reference.grid.box, sample)
+        g = look(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
+        whole = looks and inside(warp, reference.grid.box, size).all()
+        weighed = reference if whole else reweigh(reference, inside(warp, reference.grid.pixels, size))
+        increment = weighed.criterion.step(weighed, g).to(state.pose.dtype)  # eq. (9)
+        state = advance(state, increment, reference.place.lever, busy)
+    return state, g if g is not None else torch.zeros_like(reference.weight), weighed
 
 
-@np.errstate(all="ignore")
-def refine(reference: Reference, image: Tensor, state: State, settings: Settings, *, border: bool) -> tuple[State, Any]:
-    """From a start within the basin to the answer: bilinear and few pixels first, then all that is asked for.
+def look(sample: Sampler, warp: Tensor, pixels: Tensor, last: Tensor | None, busy: Tensor) -> Tensor:
+    """The patches (B, N) at ``warp`` (B, 2, 3); on a CPU those of templates that are not ``busy`` (B,) stay as they were."""
+    if last is None or not host_looks(warp.device) or busy.all():
+        return sample(warp, pixels)
+    index = busy.nonzero()[:, 0]
+    return last.index_copy(0, index, sample.select(index)(warp[index], pixels))
 
-    And which templates (B,) are settled: all with ``border``; without it no pixel may drop out of sight, and those
-    that come near the border are left alone.
+
+def advance(state: State, increment: Tensor, lever: Tensor, busy: Tensor) -> State:
+    """The state after an ``increment`` (B, 3) of those ``busy`` (B,); one that is not finite ends the iterations."""
+    delta = increment * lever
+    length = torch.linalg.vector_norm(delta, dim=1)
+    moving = (length < inf) & busy  # NaN compares as not moving
+    scale, rate = secant(state, delta, length)
+    scale = torch.minimum(scale, LONGEST_STEP * lever[:, 2] / length)
+    pose = retract(state.pose, torch.where(moving[:, None], increment * scale[:, None], 0.0))  # eq. (10)
+    error = torch.where(moving, length * scale * rate / (1 - rate), torch.where(busy, 0.0, state.error))
+    delta = torch.where(moving[:, None], delta, state.delta)
+    length, scale = torch.where(moving, length, state.length), torch.where(moving, scale, state.scale)
+    return State(pose, delta, length, scale, error, state.iterations + moving)
+
+
+def secant(state: State, delta: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Aitken (secant) acceleration: the scale of an increment ``delta`` (B, 3) of the given ``length`` (B,), and the
+    rate of convergence, (B,) each.
+
+    Noise in the template shortens every step by one factor 1 - q, so that steps shrink in a geometric series of ratio
+    q, and two of them tell its sum, step / (1 - q) (the secant method on their common line). Only near the answer,
+    where steps are such a series, and within one stage: another sampler or other pixels have another answer, to which
+    the first step is no part of it. Of that step the earlier stage tells the rate: the share it did not cover.
     """
-    size, xp, sample = (image.shape[-2], image.shape[-1]), library(state.pose), None
-    warp, todo = warps(reference, state.pose), stages(reference, settings)
-    settled = xp.ones_like(state.pose[:, 0]) > 0 if border else inside(warp, reference.box, size, margin=EDGE).all(-1)
-    for part, interpolation, tolerance, budget in todo:
-        if border:
-            state = stage(part, image, state, interpolation, tolerance, budget)
-            continue
-        if sample is None or interpolation != "bilinear":
-            sample = make_sampler(interpolation, image, warp, reference.box)
-        state = iterate(part, sample, state._replace(error=xp.where(settled, xp.inf, 0.0)), tolerance, budget)
-        warp = warps(reference, state.pose)
-        settled = settled & sample.covers(warp, reference.box, 0 if part is todo[-1][0] else EDGE)
-    return state, settled
+    last, first = state.length, ~(state.error < inf)
+    rate = torch.where(last > 0, length / last, 0.5)
+    rate = torch.where(first & (state.scale > 1), 1 - 1 / state.scale, rate).clamp(0.05, 0.95)
+    along = (state.delta * delta).sum(-1) / (last * last)  # = 1 - (last scale) * (share that a step covers)
+    usable = (last < SECANT_RANGE) & (along < 0.9) & ~first
+    return torch.where(usable, (state.scale / (1 - along)).clamp(1.0, LARGEST_SCALE), 1.0), rate
 
 
-def stages(reference: Reference, settings: Settings) -> list[tuple[Reference, str, float, int]]:
-    """What to do one after the other: the pixels, the sampler, the tolerance in px and the iterations at most."""
-    thin, budget = reference.thin, settings.max_iterations
-    if budget == 1 or (settings.interpolation == "bilinear" and thin is reference):
-        return [(reference, settings.interpolation, settings.tolerance, budget)]
-    coarse = max(budget * 2 // 3, 1)
-    return [
-        (thin, "bilinear", max(settings.tolerance, COARSE_TOLERANCE), coarse),
-        (reference, settings.interpolation, settings.tolerance, budget - coarse),
-    ]
+def summed(reference: Reference, g: Tensor) -> tuple[Tensor, Tensor]:
+    """Gain (B,) and sums (B, 10, blocks) of patches g (B, N), over the pixels of each block, of the weights w times
 
+        1, g0, g0^2, t0 g0, u g0, v g0, e^2, and of the first three rows of K times e,
 
-@np.errstate(all="ignore")
-def stage(
-    reference: Reference, image: Tensor, state: State, interpolation: str, tolerance: float, budget: int
-) -> State:
-    """``iterate`` with one sampler; templates that reach beyond the frame are weighed anew at every iteration."""
-    state = state._replace(error=torch.full_like(state.error, torch.inf), patch=torch.zeros_like(reference.K[:, 0]))
-    warp, size = warps(reference, state.pose), (image.shape[-2], image.shape[-1])
-    sample = make_sampler(interpolation, image, warp, reference.box)
-    whole = inside(warp, reference.box, size, margin=EDGE).all(-1)
-    for index, edge in ((whole, None), (~whole, size)):
-        some = index.nonzero()[:, 0]
-        if len(some):
-            begin = state.select(some).convert(Tensor.numpy if host_looks(some.device) else Tensor.clone)
-            part = sample._replace(edge=edge).select(some)
-            found = iterate(reference.select(some), part, begin, tolerance, budget)
-            state = state.merge(some, found.convert(torch.as_tensor))
-    return state
+    with g0 and t0 the patch and the template less their weighted means, (u, v) the pixel's place in ``Place.unit``, and
+    e what the criterion's model leaves of g. Of a patch that is flat but for rounding g0 is 0.
+    """
+    w, (residual, gain) = reference.weight, reference.criterion.fit(reference, g)
+    (g0, norm), (t0, _) = centred(g, w), centred(reference.signal[:, 3], w)
+    g0 = torch.where((norm * norm > FLAT * (w * g * g).sum(-1))[:, None], g0, 0.0)
+    wg, (u, v) = w * g0, reference.uv.unbind(1)
+    rows = [w.expand_as(g), wg, wg * g0, wg * t0, wg * u, wg * v, w * residual * residual]
+    rows = torch.cat((torch.stack(rows, 1), reference.K[:, :3] * residual[:, None]), 1)
+    grid = reference.grid
+    sums = rows.new_zeros(len(g), rows.shape[1], grid.blocks[0] * grid.blocks[1])
+    return gain.to(reference.place.radius.dtype), sums.index_add_(2, grid.block, rows)

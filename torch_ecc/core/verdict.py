@@ -1,197 +1,166 @@
-"""Judge the outcome of a solve: score, residual, covariance and status per template."""
+"""The verdict: score, covariance and status of solved templates, from the sums of their last look, for every engine."""
 
 from __future__ import annotations
 
-from math import pi
-from typing import Any, NamedTuple
+from functools import lru_cache
+from math import inf
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ecc.core.criteria import centred, safe_inverse
+from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.estimate import Estimate, Status
-from torch_ecc.core.pose import alike, library, rotation
-from torch_ecc.core.reference import ALIASING, Reference, reweigh
-from torch_ecc.core.sampling import NOISE_GAIN, host_looks, inside
+from torch_ecc.core.reference import Normal, Reference
+from torch_ecc.core.sampling import SAMPLERS, host_looks
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solver import State, warps
+from torch_ecc.core.solver import Solution
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
 NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
-DOUBTFUL_SHARE = 0.5  # the same, as the likely reason why a template was not found
+DOUBTFUL_SHARE = 0.5  # of the information, as the likely reason why a template was not found
+PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light is rounding
 
 
-class Sums(NamedTuple):
-    """What all pixels of B patches tell, (B,) each: the patch's ``gain``, the residual's mean square ``power``, the
-    correlation ``score``, the same ``alike`` under uneven light; and (B, 3) the residual's sums by ``blocks``."""
-
-    gain: Any
-    power: Any
-    score: Any
-    alike: Any
-    blocks: Any
-
-
-@np.errstate(all="ignore")
-def judge(
-    reference: Reference, state: State, start: Any, settings: Settings, size: tuple[int, int] | None = None
-) -> Estimate:
-    """The record of B solved templates; failed ones get their ``start`` (B, 3) back.
-
-    ``size`` (h, w) of the frame: only pixels inside it count. None if all are known to be. ``start``, the state and the
-    record hold tensors or, on a CPU, numpy arrays.
-    """
-    pose, whole, xp = state.pose, reference.at_hand, library(state.pose)
-    if size is not None:
-        seen = torch.as_tensor(inside(warps(reference, pose), reference.pixels, size))
-        reference = reweigh(reference, seen)
-    reference = reference.at_hand
-    sums = add_up(reference, state.patch, settings.min_score)
-    gain, power = (xp.where(abs(v) < xp.inf, v, 0.0) for v in (sums.gain, sums.power))
-    noise = noise_variance(reference, power, gain, NOISE_GAIN[settings.interpolation])
-    structure = clustering(reference, sums.blocks, noise * (1 + gain * gain))
-    sampler = interpolation_error(reference, pose, settings.interpolation)
-    covariance, fixed = pose_covariance(reference, noise, gain, pose, structure, sampler)
-    shown = reference.moments[:, 1] >= settings.min_visible * whole.moments[:, 1]
-    match = (sums.alike >= settings.min_score) & (gain > 0) & (abs(pose) < xp.inf).all(-1)
-    empty = whole.noise**2 * whole.noise_share > DOUBTFUL_SHARE
-    status = decide(shown, match, fixed, state.error <= settings.tolerance, empty)
+def judge(reference: Reference, found: Solution, start: Tensor, settings: Settings) -> Estimate:
+    """The record of B solved templates; failed ones get their ``start`` (B, 3) back."""
+    normal, noise_model, pose = found.normal, reference.noise, found.pose
+    sums = found.sums.sum(-1, dtype=pose.dtype).nan_to_num(0.0, 0.0, 0.0)
+    gain = found.gain.nan_to_num(0.0, 0.0, 0.0)
+    clustered = torch.linalg.vecdot(*2 * [found.sums[:, 7:]]).to(pose.dtype)
+    match = score = correlation(normal, sums)
+    if not host_looks(pose.device) or min(score.tolist()) < settings.min_score:
+        match = torch.maximum(score, detrended(normal, sums))  # light alone must not make a stranger of the template
+    square = gain * gain
+    # One image's noise: of the residuals' mean square the template's share is gain^2 v and the frame's, sampled, NG v.
+    variance = sums[:, 6] / (normal.freedom * (square + SAMPLERS[settings.interpolation].noise_gain)).clamp(min=1e-30)
+    scatter = cluster_robust(reference, normal, clustered / (1 + square)[:, None], variance)
+    alias = interpolation_error(reference, pose, settings.interpolation)
+    covariance, observable = pose_covariance(reference, normal, variance, square, pose, scatter, alias)
+    status = decide(
+        normal.total >= settings.min_visible * reference.normal.total,
+        (match >= settings.min_score) & (gain > 0),
+        observable,
+        found.error <= settings.tolerance,
+        noise_model.level.square() * reference.normal.noise_share > DOUBTFUL_SHARE,
+    )
     good = Status.good(status)
-    pose = xp.where(good[:, None], pose, start)
-    diagonal = alike(torch.eye(3, device=state.patch.device), start) > 0
-    covariance = xp.where(good[:, None, None], covariance, xp.where(diagonal, xp.inf, 0.0))
-    return Estimate(pose, pose - start, sums.score, status, state.iterations, covariance, power**0.5)
+    pose = torch.where(good[:, None], pose, start)
+    covariance = torch.where(good[:, None, None], covariance, _unknown(pose.dtype, pose.device))
+    rms = (sums[:, 6] / normal.total.clamp(min=1e-30)).clamp(min=0).sqrt()
+    return Estimate(pose, pose - start, score, status, found.iterations, covariance, rms)
 
 
-def decide(shown: Any, match: Any, fixed: Any, converged: Any, empty: Any) -> Any:
-    """Status codes (B,) int8 from what was found, (B,) bool each: enough of it is ``shown``, it is a ``match``, its
-    texture has ``fixed`` the pose, the iterations have ``converged``, it is ``empty`` of any texture of its own."""
-    xp = library(shown)
-    status = xp.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
-    status = xp.where(fixed, status, int(Status.LOW_TEXTURE))
-    status = xp.where(match, status, int(Status.LOST))
-    status = xp.where(shown, status, int(Status.OUT_OF_VIEW))
-    status = xp.where(empty & ~(match & shown), int(Status.LOW_TEXTURE), status)  # that is why
-    return xp.asarray(status, dtype=xp.int8)
+def decide(visible: Tensor, similar: Tensor, observable: Tensor, converged: Tensor, textureless: Tensor) -> Tensor:
+    """Status codes (B,) int8, from (B,) bool each: enough of a template is ``visible``, it looks ``similar``, its
+    texture makes the pose ``observable``, the iterations have ``converged``, it is ``textureless`` from the start."""
+    codes = _codes(converged.device)
+    status = torch.where(converged, codes[Status.CONVERGED], codes[Status.MAX_ITERATIONS])
+    status = torch.where(observable, status, codes[Status.LOW_TEXTURE])
+    status = torch.where(similar, status, codes[Status.LOST])
+    status = torch.where(visible, status, codes[Status.OUT_OF_VIEW])
+    return torch.where(textureless & ~(similar & visible), codes[Status.LOW_TEXTURE], status)  # that is why
 
 
-def add_up(reference: Reference, patch: Tensor, min_score: float) -> Sums:
-    """What there is to know from the pixels (B, N) of B patches, in the library of the reference's moments."""
-    moments, t, mean = reference.moments, reference.signal.select(1, 3), patch.sum(-1, keepdim=True) / patch.shape[1]
-    residual, gain = reference.criterion.fit(reference, patch)
-    rest = patch - mean
-    weighted, blocks = reference.weight * rest, patch.new_zeros(len(patch), 3, len(reference.block_sizes))
-    blocks.index_add_(2, reference.block, reference.K.narrow(1, 0, 3) * residual.unsqueeze(1))
-    power, (excess, square, along) = (
-        dot(reference.weight * residual, residual),
-        (weighted.sum(-1), dot(weighted, rest), dot(weighted, t)),
-    )
-    gain, mean, power, excess, square, along, blocks = (
-        alike(v, moments) for v in (gain, mean[:, 0], power, excess, square, along, blocks)
-    )
-    xp, total, level, norm = library(moments), moments[:, 1].clip(1e-30), moments[:, 2], moments[:, 3]
-    norm = norm * (square - excess * excess / total).clip(0) ** 0.5
-    score = ((along - excess * level) / norm.clip(1e-30)).clip(-1, 1)
-    score = xp.where(norm > 1e-12 * (square + mean * mean * total), score, 0.0)
-    alike_ = score
-    if not host_looks(patch.device) or (score < min_score).any():
-        # Light alone must not make a stranger of the template.
-        alike_ = xp.maximum(score, alike(flat_correlation(reference, patch), moments))
-    return Sums(gain, power / total, score, alike_, (blocks * blocks).sum(-1))
+def correlation(normal: Normal, sums: Tensor) -> Tensor:
+    """Zero-mean normalised correlation (B,) from the sums (B, 10) of ``solver.summed``; 0 where either is flat."""
+    tiny = torch.finfo(sums.dtype).tiny
+    return (sums[:, 3] * (sums[:, 2] * normal.energy).clamp(min=tiny).rsqrt()).clamp(-1, 1)
 
 
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Sums (B,) of the products of (1 or B, N) and (B, N)."""
-    product: Tensor = torch.linalg.vecdot(a, b)
-    return product
+def detrended(normal: Normal, sums: Tensor) -> Tensor:
+    """The same off the planes 1, u, v in template and patch: unlike ``correlation`` it does not change in light that
+    varies across the template."""
+    planes, along = normal.gram[:, :3, :3], normal.gram[:, :3, 3:]
+    both = torch.cat((along, sums[:, [1, 4, 5], None]), -1)
+    power = both.mT @ safe_inverse(planes)[0] @ both  # of both in the planes, (B, 2, 2)
+    tt, gg, tg = normal.gram[:, 3, 3] - power[:, 0, 0], sums[:, 2] - power[:, 1, 1], sums[:, 3] - power[:, 0, 1]
+    solid = (tt > PLANAR * normal.energy) & (gg > PLANAR * sums[:, 2])
+    return torch.where(solid, tg * (tt * gg).clamp(min=torch.finfo(tg.dtype).tiny).rsqrt(), 0.0).clamp(-1, 1)
 
 
-def correlation(t: Tensor, g: Tensor, weight: Tensor) -> Tensor:
-    """Zero-mean normalised correlation (B,) of t and g (B, N) under weights (1 or B, N); 0 where either is flat."""
-    (t0, dt), (g0, dg) = centred(t, weight), centred(g, weight)
-    norm = dt * dg
-    score = (weight * t0 * g0).sum(-1) / norm.clamp(min=1e-30)
-    return torch.where(norm > 1e-12 * (weight * g * g).sum(-1), score, 0.0).clamp(-1, 1)
-
-
-def flat_correlation(reference: Reference, g: Tensor) -> Tensor:
-    """Correlation (B,) of the templates and patches g (B, N) without their planes 1, x', y': unlike ``correlation``,
-    it is the same in light that varies across the template."""
-    uv = reference.uv
-    planes = torch.cat((torch.ones_like(uv[:, :1]), uv), 1)
-    weighted = planes * reference.weight[:, None]
-    inverse, _ = safe_inverse(weighted @ planes.mT)
-    both = torch.stack((reference.signal[:, 3], g - g.mean(-1, keepdim=True)), -1)
-    t, g = (both - planes.mT @ (inverse @ (weighted @ both))).unbind(-1)
-    return correlation(t, g, reference.weight)
-
-
-def noise_variance(reference: Reference, power: Any, gain: Any, sampled: float) -> Any:
-    """Variance (B,) of the noise of one image, from the residuals' mean square ``power`` (B,) = the template's share
-    gain^2 v plus the frame's, of which its sampling left ``sampled`` v; freed of the fitted columns' part."""
-    count, columns = reference.moments[:, 0], reference.K.shape[1]
-    return power * count / (count - columns).clip(1) / (gain * gain + sampled)
-
-
-def clustering(reference: Reference, clustered: Any, power: Any) -> Any:
-    """How much more the increment scatters, (B, 3), than with white noise of ``power`` (B,).
+def cluster_robust(reference: Reference, normal: Normal, clustered: Tensor, variance: Tensor) -> Tensor:
+    """Standard deviations (B, 3) that each row of K gives to noise of the given ``variance`` (B,), over those that it
+    would give to white noise of variance 1; never less than for white noise.
 
     What no noise model knows (edges that the sampler rounds, light, an occluder, blur) leaves residuals that cling
     together where the gradients are. Their effect summed block by block, its squares ``clustered`` (B, 3), tells the
-    scatter that they bring (the cluster-robust sandwich); 1 where it is not more than the white one's.
+    scatter that they bring (the cluster-robust sandwich).
     """
-    blocks, columns = len(reference.block_sizes), reference.K.shape[1]
+    blocks, columns = reference.grid.occupied, reference.K.shape[1]
     if blocks < FEW_BLOCKS * columns:  # too few to tell a scatter from
-        return 0 * clustered + 1
-    few = blocks / (blocks - columns)  # blocks are not free: the fit has made their sum zero
-    white = reference.moments[:, 4:] * power[:, None]
-    return (few * clustered / white.clip(1e-30)).clip(1.0) ** 0.5
+        return variance[:, None].sqrt().expand(-1, 3)
+    free = blocks / (blocks - columns)  # blocks are not free: the fit has made their sum zero
+    return torch.maximum(free * clustered / normal.white.clamp(min=1e-30), variance[:, None]).sqrt()
 
 
-def interpolation_error(reference: Reference, pose: Any, interpolation: str) -> Any:
-    """Covariance (B, 3, 3), in the template's axes, of what aliasing in the sampler shifts poses (B, 3) by.
+def interpolation_error(reference: Reference, pose: Tensor, interpolation: str) -> Tensor | None:
+    """What aliasing in the sampler shifts poses (B, 3) by, in the template's axes: a square root (B, 3, 2) of its
+    covariance; None where it does not count.
 
     Where all pixels lie alike between the frame's (no rotation) their errors add up; over a turned template they
-    cancel. The shift is ``Reference.alias`` times the sine of the phase, whose mean square is one half.
+    cancel: the mean of exp(2 pi i k step) over n neighbours k is sin(pi n step) / (n sin(pi step)) but for its phase
+    (Dirichlet). The shift is ``Noise.alias`` times the sine of the phase, whose mean square is one half.
     """
-    if interpolation not in ALIASING:
-        return 0.0
-    xp, shift = library(pose), alike(reference.alias, pose)[:, ALIASING.index(interpolation)]
-    sides = alike(reference.box, pose)[:2, 2] - alike(reference.box, pose)[:2, 0] + 1
-    alike_ = _alike(rotation(pose[:, 2])[:, 0], sides).prod(-1)
-    return shift @ xp.swapaxes(shift, -1, -2) * (alike_ * alike_ / 2)[:, None, None]
-
-
-def _alike(step: Any, count: Any) -> Any:
-    """Mean of exp(2 pi i k step) over ``count`` neighbours k, but for its phase: 1 for whole steps (Dirichlet)."""
-    xp, step = library(step), pi * (step - step.round())
-    return xp.where(step == 0, 1.0, xp.sin(count * step) / (count * xp.sin(step)))
+    names = [name for name, kernel in SAMPLERS.items() if kernel.aliases]
+    if interpolation not in names:
+        return None
+    step = torch.stack((pose[:, 2].cos(), pose[:, 2].sin()), -1)
+    step = step - step.round()
+    box = reference.grid.box
+    coherent = (torch.sinc((box[:2, 2] - box[:2, 0] + 1) * step) / torch.sinc(step)).prod(-1)
+    return reference.noise.alias[:, names.index(interpolation)] * (coherent / 2**0.5)[:, None, None]
 
 
 def pose_covariance(
-    reference: Reference, noise: Any, gain: Any, pose: Any, structure: Any = None, sampler: Any = 0.0
-) -> tuple[Any, Any]:
-    """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of variance ``noise`` (B,), the patch
-    ``gain`` (B,) times the template's contrast; and whether the texture fixes the pose, (B,) bool.
+    reference: Reference,
+    normal: Normal,
+    variance: Tensor,
+    square: Tensor,
+    pose: Tensor,
+    scatter: Tensor | None = None,
+    alias: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of ``variance`` (B,), the patch the
+    ``square`` (B,) of its gain times the template's power; and whether the texture makes the pose observable, (B,).
 
     Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T, turned from the
     template's axes to the frame's. The template's noise is taken out of S, and out of P for its own part P_t: a
-    derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``structure`` (B, 3): see
-    ``clustering``; ``sampler`` (B, 3, 3): see ``interpolation_error``.
+    derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 3): see
+    ``cluster_robust``, by default white; ``alias`` (B, 3, 2): see ``interpolation_error``.
     """
-    xp = library(pose)
-    own = xp.minimum(noise, reference.noise**2)
-    textured = own * reference.noise_share < NOISE_SHARE
-    noise, own, frame = (v[:, None, None] for v in (noise, own, 1 / (gain * gain).clip(1e-12)))
-    inverse, regular = safe_inverse(reference.slope - own * reference.inflation)
-    spread = (1 + frame) * reference.spread - own * reference.spread_noise
-    local = inverse @ spread @ xp.swapaxes(inverse, -1, -2) * noise
-    if structure is not None:
-        local = local * structure[:, :, None] * structure[:, None, :]
-    turn = 0 * local
-    turn[:, :2, :2], turn[:, 2, 2] = rotation(pose[:, 2]), 1.0
-    covariance = turn @ (local + sampler) @ xp.swapaxes(turn, -1, -2)
-    corner = covariance[:, 0, 0] + covariance[:, 1, 1] + covariance[:, 2, 2] * reference.radius**2
-    return covariance, regular & textured & (corner < LARGEST_SIGMA**2)
+    own = torch.minimum(variance, reference.noise.level.to(variance.dtype).square())
+    bias, frame = own[:, None, None], (1 + 1 / square.clamp(min=1e-12))[:, None, None]
+    bread = torch.linalg.inv_ex(normal.bread - bias * normal.bread_bias)[0]
+    meat = frame * normal.meat - bias * normal.meat_bias
+    scatter = variance.sqrt()[:, None] if scatter is None else scatter
+    turn = _turn(pose[:, 2])
+    bread = torch.bmm(turn, scatter[:, :, None] * bread)
+    covariance = torch.bmm(torch.bmm(bread, meat), bread.mT)
+    if alias is not None:
+        alias = torch.bmm(turn, alias)
+        covariance = torch.baddbmm(covariance, alias, alias.mT)
+    variances = covariance.diagonal(dim1=1, dim2=2)
+    corner = (variances * reference.place.lever.square()).sum(-1)
+    return covariance, (corner < LARGEST_SIGMA**2) & (own * normal.noise_share < NOISE_SHARE)
+
+
+def _turn(theta: Tensor) -> Tensor:
+    """From the template's axes x', y', theta to the frame's: (B, 3, 3)."""
+    c, s = theta.cos(), theta.sin()
+    none, one = torch.zeros_like(c), torch.ones_like(c)
+    return torch.stack((c, s, none, -s, c, none, none, none, one), -1).view(-1, 3, 3)
+
+
+@lru_cache(maxsize=16)
+@torch.inference_mode(False)
+def _unknown(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The covariance of what was not found."""
+    return torch.diag(torch.full((3,), inf, dtype=dtype, device=device))
+
+
+@lru_cache(maxsize=16)
+@torch.inference_mode(False)
+def _codes(device: torch.device) -> tuple[Tensor, ...]:
+    """Every status as a tensor, so that the host need not hand them over in every frame."""
+    return torch.tensor(list(Status), dtype=torch.int8, device=device).unbind()

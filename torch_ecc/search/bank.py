@@ -60,7 +60,7 @@ class Bank(NamedTuple):
         texture, planes = _orthonormal(texture, weights)
         shape = (fast_length(size[0] + 2 * reach), fast_length(size[1] + 2 * reach))
         spectra = (torch.fft.rfft2(kernel, s=shape).conj_physical() for kernel in (texture, planes, weights))
-        local = offset.to(reference.radius.dtype) - reference.centre[0].to(reference.radius.dtype)
+        local = offset.to(reference.place.radius.dtype) - reference.place.centre[0].to(reference.place.radius.dtype)
         return Bank(size, shape, reach, local, turns, *spectra)
 
     def candidates(self, image: Tensor, most: int) -> tuple[Tensor, Tensor]:
@@ -122,7 +122,7 @@ def details(reference: Reference, image: Tensor, turns: Tensor, most: int) -> Te
     best = torch.cat([peaks.score for peaks in found]).topk(most).indices
     place = torch.cat([peaks.place for peaks in found]).to(turns)[best]
     pose = torch.cat((place, turns.repeat_interleave(most)[best, None]), -1)
-    centre = F.pad(reference.centre, (0, 1)).to(pose)  # places are those of the array's middle
+    centre = F.pad(reference.place.centre, (0, 1)).to(pose)  # places are those of the array's middle
     return compose(pose, centre.expand_as(pose))
 
 
@@ -161,7 +161,7 @@ def search_level(references: list[Reference]) -> int:
     level, full = 0, _power(references[0].signal[:, 3], references[0])
     for k, reference in enumerate(references[1:], 1):
         variance = (4**k - 1) / 3 + INSTRUMENT_BLUR**2 * 4**k  # of all blurs up to here, px^2
-        density = 4 * math.pi * variance * _power(reference.instrument[:, 3], reference) / full
+        density = 4 * math.pi * variance * _power(reference.columns.instrument[:, 3], reference) / full
         if float(reference.weight.count_nonzero()) >= SMALLEST_SEARCHED**2 and float(density) >= LEAST_DENSITY:
             level = k
     return level
@@ -177,7 +177,7 @@ def _disc(reference: Reference) -> tuple[Tensor, float, bool]:
     """Middle (2,) of the weights, px from the middle of the array, and the radius of what is searched for: that of a
     disc wholly inside the template, if enough of the texture lies in it (True), else of all."""
     weight = reference.weight[0]
-    place = reference.pixels[:2]
+    place = reference.grid.pixels[:2]
     middle = (weight * place).sum(-1) / weight.sum()
     radius = (place - middle[:, None]).norm(dim=0)
     _, full, corner = as_images(reference)
@@ -198,9 +198,9 @@ def _disc(reference: Reference) -> tuple[Tensor, float, bool]:
 
 def _turns(reference: Reference, offset: Tensor, radius: float) -> Tensor:
     """Turns (A,) of the whole circle, so close that the correlation falls by TURN_LOSS at most half way between."""
-    x, y = reference.pixels[:2] - offset[:, None]
+    x, y = reference.grid.pixels[:2] - offset[:, None]
     weight = reference.weight[0] * (x.square() + y.square() <= radius**2)
-    gx, gy, _, t = reference.instrument[0]
+    gx, gy, _, t = reference.columns.instrument[0]
     spin = gx * y - gy * x
     loss = (weight * spin.square()).sum() / (weight * (t - (weight * t).sum() / weight.sum()).square()).sum() / 2
     step = 2 * math.sqrt(TURN_LOSS / max(float(loss), 1e-6))
@@ -220,9 +220,9 @@ def _turned(template: Tensor, weight: Tensor, middle: Tensor, turns: Tensor, rea
     warp = torch.cat((rotation(-turns), middle[:, None].expand(len(turns), 2, 1)), -1)
     size = (template.shape[-2], template.shape[-1])
     framed = inside(warp, pixels, size)
-    spline = Sampler.of(weighted, 3)
+    spline = Sampler.of(weighted, "bspline3")
     shape = (len(turns), n, n)
-    return (spline(warp, pixels) * framed).view(shape), (Sampler(weight)(warp, pixels) * framed).view(shape)
+    return (spline(warp, pixels) * framed).view(shape), (Sampler.of(weight)(warp, pixels) * framed).view(shape)
 
 
 def _disc_image(reach: int, radius: float) -> Tensor:

@@ -15,15 +15,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.align import solve
+from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.frame import as_gray
-from torch_ecc.core.pose import Array, unwrap
+from torch_ecc.core.pose import unwrap
 from torch_ecc.core.pyramid import pyramid
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import Sampler, halve, inside
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solver import State, stage, warps
-from torch_ecc.core.verdict import flat_correlation
+from torch_ecc.core.solver import State, iterate
 from torch_ecc.search.bank import Bank, details, search_level
 
 LEVELS = 8  # of a pyramid at most: it ends where the template gets too small
@@ -135,7 +135,7 @@ class Locator:
         if near is not None and (near.dim() != 2 or len(near) != count or near.shape[1] not in (2, 3)):
             raise ValueError(f"locate: near must be ({count}, 2) or ({count}, 3), got {tuple(near.shape)}")
         images = halvings(gray, self.levels)
-        places = [None] * count if near is None else list(near.to(self.pyramids[0][0].radius))
+        places = [None] * count if near is None else list(near.to(self.pyramids[0][0].place.radius))
         return _decide([self.candidates(images, b, places[b], closer=True) for b in range(count)])
 
     def candidates(
@@ -151,22 +151,22 @@ class Locator:
         pose = self.coarse(images, b)
         chosen, rest = pose[:FINALISTS], pose[FINALISTS:]
         if near is not None and len(rest):
-            chosen = torch.cat((chosen, rest[distance(rest, near, reference.radius).argmin()][None]))
+            chosen = torch.cat((chosen, rest[distance(rest, near, reference.place.radius).argmin()][None]))
         found = self.refined(images[0], b, chosen)
-        best = _decide([ranked(found, reference.radius)])
-        slid = distance(best.pose, chosen, reference.radius).min() > LONGEST_WAY  # perhaps past the place
+        best = _decide([ranked(found, reference.place.radius)])
+        slid = distance(best.pose, chosen, reference.place.radius).min() > LONGEST_WAY  # perhaps past the place
         if closer and bool(best.ambiguous | slid):
-            turns = both_ways(pose[:, 2], reference.radius)
+            turns = both_ways(pose[:, 2], reference.place.radius)
             more = self.refined(images[0], b, details(reference, images[0][0, 0], turns, DETAILED))
             found = Estimate(*map(torch.cat, zip(found[0], more[0], strict=True))), torch.cat((found[1], more[1]))
-        return ranked(found, reference.radius, near)
+        return ranked(found, reference.place.radius, near)
 
     def refined(self, image: Tensor, b: int, pose: Tensor) -> tuple[Estimate, Tensor]:
         """Template ``b`` aligned with ``image`` (1, 1, H, W) from poses (K, 3): estimate and score."""
         copies = _copies(self.pyramids[b][0], len(pose))
         estimate = solve(copies, image, pose, self.settings)
         for _ in range(REPEATS):  # where the texture lets a pose slide, iterations are spent on the way
-            way = distance(estimate.displacement, torch.zeros_like(pose), copies.radius)
+            way = distance(estimate.displacement, torch.zeros_like(pose), copies.place.radius)
             far = (way > LONGEST_WAY).nonzero()[:, 0]
             if len(far) == 0:
                 break
@@ -179,7 +179,7 @@ class Locator:
         references, bank = self.pyramids[b], self.banks[b]
         top = len(references) - 1
         pose, score = bank.candidates(images[top][0, 0], CANDIDATES)
-        pose = pose[foremost(pose, score, references[top].radius, NEIGHBOURS, HANDICAP[0])]
+        pose = pose[foremost(pose, score, references[top].place.radius, NEIGHBOURS, HANDICAP[0])]
         for level in range(top, min(top, 1) - 1, -1):  # the last level is left to the refinement
             pose = descend(references[level], images[level], pose)
             pose = pose * pose.new_tensor((2.0, 2.0, 1.0)) if level else pose
@@ -197,19 +197,32 @@ def halvings(image: Tensor, levels: int) -> list[Tensor]:
 def descend(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
     """Candidates (K, 3) of one template brought to their best nearby: those that differ and may be it, best first."""
     copies = _copies(reference, len(pose))
-    state = stage(copies, image, State.start(copies, pose), "bilinear", COARSE_TOLERANCE, COARSE_ITERATIONS)
+    state, *_ = iterate(copies, image, "bilinear", State.start(pose), COARSE_TOLERANCE, COARSE_ITERATIONS)
     before, after = likeness(copies, image, pose), likeness(copies, image, state.pose)
     pose = torch.where((after > before)[:, None], state.pose, pose)
-    return pose[foremost(pose, torch.maximum(before, after), reference.radius, DISTINCT, HANDICAP[1])[:SURVIVORS]]
+    return pose[foremost(pose, torch.maximum(before, after), reference.place.radius, DISTINCT, HANDICAP[1])[:SURVIVORS]]
 
 
 def likeness(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
     """Correlation (K,) off the plane of light at poses (K, 3); -1 where too little of the template is in the image."""
-    warp = warps(reference, pose)
-    weight = reference.weight * inside(warp, reference.pixels, (image.shape[-2], image.shape[-1]))
-    score = flat_correlation(reference._replace(weight=weight), Sampler(image)(warp, reference.pixels))
+    warp = reference.warps(pose)
+    weight = reference.weight * inside(warp, reference.grid.pixels, (image.shape[-2], image.shape[-1]))
+    score = flat_correlation(reference, weight, Sampler.of(image)(warp, reference.grid.pixels))
     enough = (weight.sum(-1) >= LEAST_SEEN * reference.weight.sum(-1)) & pose.isfinite().all(-1)
     return torch.where(enough, score, -1.0)
+
+
+def flat_correlation(reference: Reference, weight: Tensor, g: Tensor) -> Tensor:
+    """Correlation (K,) of the templates and patches g (K, N) under ``weight`` (K, N) without their planes 1, u, v."""
+    planes = torch.cat((torch.ones_like(g)[:, None], reference.uv), 1)
+    weighted = planes * weight[:, None]
+    inverse, _ = safe_inverse(weighted @ planes.mT)
+    both = torch.stack((reference.signal[:, 3], g - g.mean(-1, keepdim=True)), -1)
+    t, g = (both - planes.mT @ (inverse @ (weighted @ both))).unbind(-1)
+    (t0, dt), (g0, dg) = centred(t, weight), centred(g, weight)
+    norm = dt * dg
+    score = (weight * t0 * g0).sum(-1) / norm.clamp(min=1e-30)
+    return torch.where(norm > 1e-12 * (weight * g * g).sum(-1), score, 0.0).clamp(-1, 1)
 
 
 def distance(a: Tensor, b: Tensor, radius: Tensor) -> Tensor:
@@ -259,7 +272,7 @@ def _copies(reference: Reference, count: int) -> Reference:
     return reference.select(torch.zeros(count, dtype=torch.int64, device=reference.K.device))
 
 
-def as_good(score: Array, best: Array) -> Array:
+def as_good(score: Tensor, best: Tensor) -> Tensor:
     """Whether a ``score`` tells no worse match than the ``best`` one, any shape: bool."""
     factor, slack = AS_GOOD
     return 1 - score <= factor * (1 - best) + slack

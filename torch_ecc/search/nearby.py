@@ -52,26 +52,26 @@ class Nearby(NamedTuple):
         """Of prepared templates."""
         template, weight, corner = as_images(reference)
         h, w = template.shape[-2:]
-        middle = corner + corner.new_tensor((w - 1, h - 1)) / 2 - reference.centre
+        middle = corner + corner.new_tensor((w - 1, h - 1)) / 2 - reference.place.centre
         weight = weight / weight.sum((2, 3), keepdim=True)
         template = template - (weight * template).sum((2, 3), keepdim=True)
         for step in STEPS:
             texture, weights = _coarser(template, weight, step)
             if step == 1 or _tells(texture, weights, template, weight, step):
                 break
-        texture, weights = _turned(texture, weights, _turns(reference.radius.to(template)))
+        texture, weights = _turned(texture, weights, _turns(reference.place.radius.to(template)))
         reach = 2 * math.ceil(FARTHEST / step) + 2
         shape = (texture.shape[-2] + reach, texture.shape[-1] + reach)
         size = [fast_length(n) for n in shape]
         spectra = (torch.fft.rfft2(kernel, s=size).conj_physical() for kernel in (texture, weights))
-        return Nearby(step, shape, middle.to(reference.radius), *spectra)
+        return Nearby(step, shape, middle.to(reference.place.radius), *spectra)
 
     def find(self, reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
         """The templates in ``image`` (1 or B, 1, H, W) around ``pose`` (B, 3): the nearest of those places that are not
         clearly worse than another."""
         place, score = self.candidates(image, pose)
         step = place - pose[:, None]
-        away = torch.cat((step[..., :2], step[..., 2:] * reference.radius[:, None, None]), -1).norm(dim=-1)
+        away = torch.cat((step[..., :2], step[..., 2:] * reference.place.radius[:, None, None]), -1).norm(dim=-1)
         order = torch.where(score >= score[:, :1] - HANDICAP, away, torch.inf).sort(-1)
         place = place.gather(1, order.indices[..., None].expand_as(place))
         best = solve(reference, image, place[:, 0], settings)
@@ -113,7 +113,7 @@ class Nearby(NamedTuple):
         turn = rotation(pose[:, 2])
         warp = torch.cat((turn, pose[:, :2, None] + turn @ self.middle[:, :, None]), -1)
         pixels = torch.stack((x.flatten(), y.flatten(), torch.ones_like(x.flatten())))
-        g = Sampler(image)(warp, pixels).view(-1, *sides)
+        g = Sampler.of(image)(warp, pixels).view(-1, *sides)
         g = _rows(sides[0], self.shape[0], self.step, g) @ g @ _rows(sides[1], self.shape[1], self.step, g).mT
         return g - g.mean((1, 2), keepdim=True)
 
@@ -173,7 +173,7 @@ def _turned(texture: Tensor, weights: Tensor, turns: Tensor) -> tuple[Tensor, Te
     middle = turns.new_tensor(((w - 1) / 2, (h - 1) / 2))[None, :, None].expand(len(turns), 2, 1)
     warp = torch.cat((rotation(-turns), middle), -1).repeat(b, 1, 1)
     both = torch.stack((texture, weights)).repeat_interleave(len(turns), 1)
-    t, weight = (Sampler(image)(warp, planes) for image in both)
+    t, weight = (Sampler.of(image)(warp, planes) for image in both)
     weight = weight * inside(warp, planes, (h, w))
     weighted = planes * weight[:, None]
     inverse, _ = safe_inverse(weighted @ planes.mT)

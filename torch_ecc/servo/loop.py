@@ -74,7 +74,7 @@ class _Run:
 
     def __init__(self, tracker: Tracker, goal: Tensor, controller: Controller, travel: Tensor | None) -> None:
         self.tracker, self.goal, self.controller, self.travel = tracker, goal, controller, travel
-        self.watch = Watch(controller.control, float(tracker.references[0].radius[0]))
+        self.watch = Watch(controller.control, float(tracker.references[0].place.radius[0]))
         self.pose, self.frames, self._fresh, self._started = goal, 0, False, False
 
     def step(self, frame: Tensor, estimate: Estimate) -> tuple[Step, Ending | None]:
@@ -141,7 +141,7 @@ def _as_pose(desired: Tensor | Sequence[float]) -> Tensor:
 def _check_view(tracker: Tracker, goal: Tensor) -> None:
     """ValueError if the first template would leave the frame at ``goal`` (3,)."""
     reference, (height, width) = tracker.references[0], tracker.frame_shape[-2:]
-    corners = reference.box[:2].mT.double().cpu() - reference.centre[0].double().cpu()
+    corners = reference.grid.box[:2].mT.double().cpu() - reference.place.centre[0].double().cpu()
     x, y = transform(goal, corners).unbind(1)
     if float(x.min()) < 0 or float(y.min()) < 0 or float(x.max()) > width - 1 or float(y.max()) > height - 1:
         spans = " and ".join(f"{n} = {float(v.min()):.1f} to {float(v.max()):.1f}" for n, v in (("x", x), ("y", y)))

@@ -1,18 +1,54 @@
-// torch.ops.torch_ecc: align.solve and one step of the tracker for templates on the CPU, in parallel over them.
+// torch.ops.torch_ecc.solve: the loop of core/solver.py for templates on the CPU, in parallel over them.
 #include <ATen/Parallel.h>
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
-#include <ATen/ops/empty_like.h>
+#include <ATen/ops/zeros.h>
 #include <torch/library.h>
 
 #include <atomic>
 
-#include "judge.h"
-#include "pack.h"
+#include "summed.h"
 
 namespace {
 
 using at::Tensor;
+
+template <class... Words>
+void require(bool right, const Words&... words) {
+  TORCH_CHECK_VALUE(right, "torch_ecc.solve: ", words...);
+}
+
+void require(const Tensor& tensor, const char* name, at::ScalarType kind, std::initializer_list<int64_t> sizes) {
+  require(tensor.device().is_cpu() && tensor.scalar_type() == kind && tensor.is_contiguous() && tensor.sizes() == at::IntArrayRef(sizes),
+          name, " must be ", kind, " ", at::IntArrayRef(sizes), ", contiguous, on the CPU; got ", tensor.scalar_type(), " ", tensor.sizes());
+}
+
+struct Planes {  // packed.Packed: one grid of all templates
+  Tensor planes, weight, numbers;
+  int64_t width, step;
+
+  Planes(at::TensorList tensors, int64_t width, int64_t step, int64_t count)
+      : planes(tensors[0]), weight(tensors[1]), numbers(tensors[2]), width(width), step(step) {
+    require(planes.dim() == 4, "planes must be (B, ", int(ecc::PLANES), ", h, pitch), got ", planes.sizes());
+    const int64_t h = planes.size(2), pitch = planes.size(3);
+    require(planes, "planes", at::kShort, {count, ecc::PLANES, h, pitch});
+    require(h > 0 && width > 0 && width <= pitch && pitch % ecc::LANES == 0 && step > 0,
+            "planes must have rows, width be 1 to their pitch, a multiple of ", ecc::LANES, ", and step at least 1");
+    require(numbers, "numbers", at::kDouble, {count, sizeof(ecc::Numbers) / sizeof(double)});
+    if (weight.dim() == 3 && weight.size(0) == 1 && weight.size(1) == 1)
+      require(weight, "weight", at::kFloat, {1, 1, pitch});
+    else
+      require(weight, "weight", at::kFloat, {count, h, pitch});
+  }
+
+  ecc::Pixels of(int64_t b) const {
+    const int64_t h = planes.size(2), pitch = planes.size(3);
+    const bool even = weight.numel() == pitch && h > 1;
+    return {planes.const_data_ptr<int16_t>() + b * ecc::PLANES * h * pitch,
+            reinterpret_cast<const ecc::Numbers*>(numbers.const_data_ptr<double>()) + b,
+            {weight.const_data_ptr<float>() + (even ? 0 : b * h * pitch), even ? 0 : pitch}, width, h, pitch, double(step)};
+  }
+};
 
 ecc::Frame frame_of(const Tensor& image, int64_t b) {
   const auto kind = image.scalar_type();
@@ -23,121 +59,84 @@ ecc::Frame frame_of(const Tensor& image, int64_t b) {
                                 : ecc::Frame::F32};
 }
 
-struct Outcome {  // the fields of Estimate, and how many templates have a status: others wait for the torch path
-  Tensor pose, displacement, score, status, iterations, covariance, residual;
-  int64_t unsettled;
-
-  std::vector<Tensor> fields() const { return {pose, displacement, score, status, iterations, covariance, residual}; }
-};
-
-// image (1 or B, 1, H, W) uint8, uint16 or float32, templates (B, bytes) of pack, poses to start from (B, 3) float64.
-// Templates at the frame's border, where pixels drop out, are not settled: status -1.
-Outcome align(const Tensor& image, const Tensor& templates, const Tensor& start, const ecc::Settings& set) {
-  const Tensor rows = image.stride(3) == 1 ? image : image.contiguous(), poses = start.contiguous();
-  const int64_t count = poses.size(0);
-  const auto real = poses.options();
-  Outcome out{at::empty({count, 3}, real), at::empty({count, 3}, real), at::empty({count}, real),
-              at::empty({count}, real.dtype(at::kChar)), at::empty({count}, real.dtype(at::kLong)),
-              at::empty({count, 3, 3}, real), at::empty({count}, real), 0};
-  double *pose = out.pose.data_ptr<double>(), *moved = out.displacement.data_ptr<double>(),
-         *score = out.score.data_ptr<double>(), *covariance = out.covariance.data_ptr<double>(),
-         *residual = out.residual.data_ptr<double>();
-  int8_t* status = out.status.data_ptr<int8_t>();
-  int64_t* iterations = out.iterations.data_ptr<int64_t>();
+// See core/native.py. Pose, error, iterations, gain and sums of solver.Solution; and of the templates that were seen in
+// part their index (n,) and moments (n, ...).
+std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorList grid,
+                          at::IntArrayRef widths, at::IntArrayRef steps, int64_t criterion, int64_t degree,
+                          int64_t max_iterations, double tolerance) {
+  const int64_t count = start.dim() ? start.size(0) : 0;
+  const auto kind = image.scalar_type();
+  require(start.device().is_cpu() && start.scalar_type() == at::kDouble && start.sizes() == at::IntArrayRef({count, 3}),
+          "pose must be float64 (B, 3) on the CPU, got ", start.scalar_type(), " ", start.sizes());
+  require(image.device().is_cpu() && (kind == at::kByte || kind == at::kUInt16 || kind == at::kFloat) && image.dim() == 4 &&
+              (image.size(0) == 1 || image.size(0) == count) && image.size(1) == 1 && image.numel() > 0,
+          "image must be uint8, uint16 or float32, (1 or ", count, ", 1, H, W) on the CPU, got ", kind, " ", image.sizes());
+  require(criterion == ecc::PAPER || criterion == ecc::SSD || criterion == 0 || criterion == 2 || criterion == 5,
+          "criterion must be -2, -1, 0, 2 or 5, got ", criterion);
+  require(degree == 1 || degree == 3 || degree == 5, "degree must be 1, 3 or 5, got ", degree);
+  require(max_iterations >= 1, "max_iterations must be at least 1, got ", max_iterations);
+  const size_t grids = grid.size() / 3;
+  require(grid.size() == 3 * grids && (grids == 1 || grids == 2) && widths.size() == grids && steps.size() == grids,
+          "expected planes, weight, numbers, width and step of one or two grids");
+  const Planes all(grid.slice(0, 3), widths[0], steps[0], count);
+  const Planes coarse(grid.slice(3 * (grids - 1), 3), widths[grids - 1], steps[grids - 1], count);
+  require(coarse.planes.size(2) <= all.planes.size(2) && coarse.planes.size(3) <= all.planes.size(3),
+          "the second grid must not be larger than the first");
+  const Tensor rows = image.stride(3) == 1 ? image : image.contiguous(), from = start.contiguous();
+  const ecc::Settings settings{degree, max_iterations, tolerance};
+  const auto blocks = [](int64_t n) { return (n + ecc::BLOCK - 1) / ecc::BLOCK; };
+  const int64_t each = blocks(all.planes.size(2)) * blocks(widths[0]);
+  const auto real = from.options();
+  const Tensor pose = at::empty({count, 3}, real), error = at::empty({count}, real),
+               iterations = at::empty({count}, real.dtype(at::kLong)), gain = at::empty({count}, real),
+               sums = at::empty({count, ecc::SUMS, each}, real.dtype(at::kFloat));
+  std::vector<ecc::Moments> moments(count);
+  std::vector<char> partial(count);
   std::atomic<int64_t> next{0};  // each thread takes the next one: they are not equally much work
   at::parallel_for(0, std::min<int64_t>(count, at::get_num_threads()), 1, [&](int64_t, int64_t) {
     thread_local ecc::Scratch scratch;
     for (int64_t b = next++; b < count; b = next++) {
-      const auto& t = *reinterpret_cast<const ecc::Template*>(templates.const_data_ptr<uint8_t>() + b * templates.size(1));
-      const double* from = poses.const_data_ptr<double>() + 3 * b;
-      ecc::State state{{from[0], from[1], from[2]}};
-      ecc::Verdict verdict{};
-      verdict.status = ecc::Status(-1);
-      if (ecc::refine(t, frame_of(rows, b), set, state, scratch)) verdict = ecc::judge(t, set, state, scratch);
-      const bool good = ecc::good(verdict.status);
-      for (int k = 0; k < 3; ++k) {
-        pose[3 * b + k] = good ? state.pose[k] : from[k];
-        moved[3 * b + k] = pose[3 * b + k] - from[k];
+      const ecc::Template t{criterion, criterion < 0 ? 3 : 5 + criterion, grids == 2, all.of(b), coarse.of(b)};
+      const double* at = from.const_data_ptr<double>() + 3 * b;
+      ecc::State state{{at[0], at[1], at[2]}};
+      float* const out = sums.data_ptr<float>() + b * ecc::SUMS * each;
+      const bool seen = ecc::solve(t, frame_of(rows, b), settings, state, scratch);
+      partial[b] = scratch.partial;
+      if (seen)
+        ecc::summed(t, scratch, out);
+      else
+        std::fill_n(out, ecc::SUMS * each, 0.f);
+      if (scratch.partial && seen) {
+        ecc::complete(t, t.whole, scratch.border);
+        moments[b] = scratch.border.moments;
       }
-      for (int k = 0; k < 9; ++k) covariance[9 * b + k] = good ? verdict.covariance[k] : k % 4 ? 0 : HUGE_VAL;
-      score[b] = verdict.score;
-      status[b] = verdict.status;
-      iterations[b] = state.iterations;
-      residual[b] = std::sqrt(verdict.power);
+      std::copy_n(state.pose, 3, pose.data_ptr<double>() + 3 * b);
+      error.data_ptr<double>()[b] = state.error;
+      iterations.data_ptr<int64_t>()[b] = state.iterations;
+      gain.data_ptr<double>()[b] = seen ? scratch.model.fit[3] : 0;
     }
   });
-  out.unsettled = std::count(status, status + count, int8_t(-1));
-  return out;
-}
-
-Tensor pack(at::TensorList reference, int64_t criterion) { return ecc::Packer(reference, criterion).pack(); }
-
-std::vector<Tensor> solve(const Tensor& image, const Tensor& templates, const Tensor& pose,
-                          int64_t degree, int64_t max_iterations, double tolerance, double min_score) {
-  return align(image, templates, pose, {degree, max_iterations, tolerance, min_score}).fields();
-}
-
-// One frame of Tracker: state = [pose, velocity, start, score, tracked, doubted] -> the fields of Estimate and the next
-// state; the fields alone, as of solve, if some are to be searched for or are not settled.
-std::vector<Tensor> track(const Tensor& image, const Tensor& templates, at::TensorList state, int64_t degree,
-                          int64_t max_iterations, double tolerance, double min_score, bool hold, bool search) {
-  const int64_t count = state[0].size(0);
-  std::vector<Tensor> now, next;
-  for (const Tensor& tensor : state) {
-    now.push_back(tensor.contiguous());
-    next.push_back(at::empty_like(now.back()));
-  }
-  const double *pose = now[0].const_data_ptr<double>(), *velocity = now[1].const_data_ptr<double>(),
-               *start = now[2].const_data_ptr<double>(), *usual = now[3].const_data_ptr<double>();
-  double *next_pose = next[0].data_ptr<double>(), *next_velocity = next[1].data_ptr<double>();
-  next[2] = now[2];
-  for (int64_t b = 0; b < count; ++b) ecc::compose(pose + 3 * b, velocity + 3 * b, next_pose + 3 * b);
-  const Outcome out = align(image, templates, next[0], {degree, max_iterations, tolerance, min_score});
-  const double* score = out.score.const_data_ptr<double>();
-  const int8_t* status = out.status.const_data_ptr<int8_t>();
-  const auto strange = [&](int64_t b) {  // Tracker._strange
-    return !ecc::good(status[b]) || 1 - score[b] > ecc::WORSE * (1 - usual[b]) + ecc::SLACK;
-  };
-  bool all_familiar = true;
-  for (int64_t b = 0; b < count; ++b) all_familiar = all_familiar && !strange(b);
-  if (out.unsettled || (search && !all_familiar)) return out.fields();
-  for (int64_t b = 0; b < count; ++b) {  // Tracker._advance
-    const bool good = ecc::good(status[b]);
-    double *found = out.pose.data_ptr<double>() + 3 * b, *moved = out.displacement.data_ptr<double>() + 3 * b;
-    if (!good) std::copy(pose + 3 * b, pose + 3 * b + 3, found);
-    for (int k = 0; k < 3; ++k) {
-      next_pose[3 * b + k] = found[k];
-      next_velocity[3 * b + k] = 0;
-      moved[k] = found[k] - start[3 * b + k];
+  const int64_t n = std::count(partial.begin(), partial.end(), 1);
+  constexpr int64_t doubles = sizeof(ecc::Moments) / sizeof(double);
+  const Tensor index = at::empty({n}, real.dtype(at::kLong)), of = at::empty({n, doubles}, real);
+  for (int64_t b = 0, k = 0; b < count; ++b)
+    if (partial[b]) {
+      index.data_ptr<int64_t>()[k] = b;
+      std::copy_n(reinterpret_cast<const double*>(&moments[b]), doubles, of.data_ptr<double>() + doubles * k++);
     }
-    if (good && !hold && now[4].const_data_ptr<bool>()[b]) ecc::between(pose + 3 * b, found, next_velocity + 3 * b);
-    next[3].data_ptr<double>()[b] = good ? usual[b] + ecc::MEMORY * (score[b] - usual[b]) : usual[b];
-    next[4].data_ptr<bool>()[b] = good;
-    next[5].data_ptr<int64_t>()[b] = strange(b) ? now[5].const_data_ptr<int64_t>()[b] + 1 : 0;
-  }
-  std::vector<Tensor> all = out.fields();
-  all.insert(all.end(), next.begin(), next.end());
-  return all;
+  return {pose, error, iterations, gain, sums, index, of};
 }
 
 }  // namespace
 
 TORCH_LIBRARY(torch_ecc, m) {
-  m.def("pack(Tensor[] reference, int criterion) -> Tensor");
   m.def(
-      "solve(Tensor image, Tensor templates, Tensor pose, int degree, int max_iterations, float tolerance, "
-      "float min_score) -> Tensor[]");
-  m.def(
-      "track(Tensor image, Tensor templates, Tensor[] state, int degree, int max_iterations, float tolerance, "
-      "float min_score, bool hold, bool search) -> Tensor[]");
+      "solve(Tensor image, Tensor pose, Tensor[] grids, int[] widths, int[] steps, int criterion, "
+      "int degree, int max_iterations, float tolerance) -> Tensor[]");
 }
 
-TORCH_LIBRARY_IMPL(torch_ecc, CPU, m) {
-  m.impl("pack", &pack);
-  m.impl("solve", &solve);
-  m.impl("track", &track);
-}
+TORCH_LIBRARY_IMPL(torch_ecc, CPU, m) { m.impl("solve", &solve); }
 
 TORCH_LIBRARY_IMPL(torch_ecc, Autograd, m) {  // nothing here has a gradient: no time is spent on the question
-  for (const char* name : {"pack", "solve", "track"}) m.impl(name, torch::CppFunction::makeFallthrough());
+  m.impl("solve", torch::CppFunction::makeFallthrough());
 }

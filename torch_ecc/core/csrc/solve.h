@@ -1,60 +1,49 @@
-// The loop of torch_ecc/solver.py for one template: see there for the reasons behind each step and constant.
+// The loop of torch_ecc/core/solver.py for one template: see there for the reasons behind each step and constant.
 #pragma once
-#include <numeric>
-
-#include "template.h"
+#include "border.h"
 
 namespace ecc {
 
-constexpr double COARSE_TOLERANCE = 0.02, SECANT_RANGE = 1.0, LARGEST_STRETCH = 5.0, LONGEST_STEP = 0.2;
-constexpr double CLEAR = 0.2;  // share of what is left of a patch
-constexpr double EDGE = 4, INFINITE = HUGE_VAL;
-constexpr double MEMORY = 0.05, WORSE = 1.5, SLACK = 0.01;  // tracker.MEMORY, locate.AS_GOOD
+constexpr double INFINITE = HUGE_VAL;
+constexpr int64_t BAND = 4 * BLOCK;  // rows that are sampled and summed together
 
 struct State {
-  double pose[3], delta[3] = {0, 0, 0}, factor = 1, error = INFINITE;
+  double pose[3], delta[3] = {0, 0, 0}, length = 0, scale = 1, error = INFINITE;
   int64_t iterations = 0;
 };
 
 struct Settings {
   int64_t degree, max_iterations;
-  double tolerance, min_score;
+  double tolerance;
 };
 
-struct Scratch {  // of one thread, kept from call to call; all but the window is of the last patch sampled
+struct Model {  // of a patch: its Z W (g - base), the step, and what the criterion's fit makes of it
+  float base = 0;
+  Coefficients sums{}, fit{};  // fit: of criteria.py's columns, with g's own offset in place of the one from base
+  double square = 0, step[3] = {0, 0, 0};
+};
+
+struct Scratch {  // of one thread, kept from call to call
   Window window;
-  std::vector<float> patch, lines;  // (height, pitch); (rows of blocks, lines_of, pitch), if it is of a whole template
-  std::vector<float> rest;          // room for three lines, and three of blocks
-  Coefficients model, change;       // what its sums count from, and what its fit has more of each column
-  Sums sums;
+  std::vector<float> patch, lines;  // (height, pitch), of the last look
+  Border border;
+  Model model;
+  bool partial;  // whether pixels were out of its sight
 
-  double gain() const { return model[3] + change[3]; }
+  const Weighted& weighted(const Pixels& p) const { return partial ? border.weighted : p.n->weighted; }
+  Weights weights(const Pixels& p) const { return partial ? Weights{border.weight.data(), p.pitch} : p.weights; }
 };
-
-// pose.compose, and pose.compose(pose.inverse(a), b).
-inline void compose(const double* a, const double* b, double* out) {
-  const double c = std::cos(a[2]), s = std::sin(a[2]);
-  out[0] = a[0] + c * b[0] + s * b[1];
-  out[1] = a[1] + c * b[1] - s * b[0];
-  out[2] = a[2] + b[2];
-}
-
-inline void between(const double* a, const double* b, double* out) {
-  const double c = std::cos(a[2]), s = std::sin(a[2]), x = b[0] - a[0], y = b[1] - a[1];
-  out[0] = c * x - s * y;
-  out[1] = s * x + c * y;
-  out[2] = b[2] - a[2];
-}
 
 // Of pixel positions relative to the template's centre.
 inline Warp warp_of(const double (&pose)[3]) { return {std::cos(pose[2]), std::sin(pose[2]), pose[0], pose[1]}; }
 
 // Smallest rectangle around the warped template.
-inline void bounds(const Template& t, const Warp& w, double (&low)[2], double (&high)[2]) {
+inline void bounds(const Pixels& p, const Warp& w, double (&low)[2], double (&high)[2]) {
   low[0] = low[1] = INFINITE;
   high[0] = high[1] = -INFINITE;
   for (int k = 0; k < 4; ++k) {
-    const double x = t.box[0][k] - t.centre[0], y = t.box[1][k] - t.centre[1];
+    const double x = p.n->left + (k % 2 ? double(p.width - 1) * p.step : 0);
+    const double y = p.n->top + (k / 2 ? double(p.height - 1) * p.step : 0);
     const double point[2] = {w.c * x + w.s * y + w.x0, w.c * y - w.s * x + w.y0};
     for (int d = 0; d < 2; ++d) {
       low[d] = std::min(low[d], point[d]);
@@ -63,181 +52,132 @@ inline void bounds(const Template& t, const Warp& w, double (&low)[2], double (&
   }
 }
 
-// False for NaN, which compares as neither here nor there: no place in memory could be made of it.
-inline bool inside(const Template& t, const double (&pose)[3], const Frame& frame, double margin) {
-  double low[2], high[2];
-  if (!std::isfinite(pose[0]) || !std::isfinite(pose[1]) || !std::isfinite(pose[2])) return false;
-  bounds(t, warp_of(pose), low, high);
-  return low[0] >= margin && low[1] >= margin && high[0] <= double(frame.w - 1) - margin &&
-         high[1] <= double(frame.h - 1) - margin;
-}
-
+// Brings the neighbourhood of the patch into the window, and weighs the template by what the frame shows of it. False if
+// that is nothing, as of a pose that is not finite, which no place in memory could be made of.
 template <int degree>
-void cover(const Template& t, const Frame& frame, const Warp& warp, Window& window, bool anew) {
+bool find(const Template& t, const Pixels& p, const Frame& frame, const Warp& warp, bool anew, Scratch& scratch) {
   double low[2], high[2];
-  bounds(t, warp, low, high);
+  bounds(p, warp, low, high);
+  scratch.partial = !(low[0] >= -ECC_ROUNDING && low[1] >= -ECC_ROUNDING && high[0] <= double(frame.w - 1) + ECC_ROUNDING &&
+                      high[1] <= double(frame.h - 1) + ECC_ROUNDING);
+  if (scratch.partial && !weigh(t, p, warp, frame, scratch.border)) return false;
+  Window& window = scratch.window;
   const double first = degree / 2, last = (degree + 1) / 2;
   const bool covered = low[0] - first >= double(window.x0) && low[1] - first >= double(window.y0) &&
                        high[0] + last <= double(window.x0 + window.w - 1) &&
                        high[1] + last <= double(window.y0 + window.h - 1);
   if (anew || !covered) open_window<degree>(frame, low, high, degree == 1 ? 4 : 1, window);
-}
-
-// What the patch is likely made of, after an earlier look if there was one: where little is left, sums lose little.
-inline Coefficients expected(const Template& t, const Scratch& scratch, bool whole, bool anew) {
-  Coefficients model{0, 0, 0, 0, scratch.patch[(whole ? t.whole : t.thin).width / 2]};
-  if (whole && t.criterion == SSD) model = {0, 0, 0, 1, t.whole.level};
-  if (whole && t.criterion != SSD && !anew && scratch.gain() > 0 && scratch.gain() < INFINITE)
-    for (int k = 3; k < MOST; ++k) model[k] = scratch.model[k] + scratch.change[k];
-  return model;
+  return true;
 }
 
 // Samples the patch and adds up its products.
-template <int degree, bool whole>
-void look(const Template& t, const Warp& warp, bool anew, Scratch& scratch) {
-  const Pixels& p = whole ? t.whole : t.thin;
+template <int degree>
+void look(const Template& t, const Pixels& p, const Warp& warp, Scratch& scratch) {
   const Window& window = scratch.window;
   const double x0 = warp.x0 - double(window.x0 + degree / 2), y0 = warp.y0 - double(window.y0 + degree / 2);
-  float* lines = scratch.lines.data();
-  scratch.sums = {};
-  for (int64_t first = 0; first < p.height; first += BLOCK) {
-    const int64_t rows = std::min(BLOCK, p.height - first);
+  Model& m = scratch.model;
+  m.sums = {};
+  m.square = 0;
+  for (int64_t first = 0; first < p.height; first += BAND) {
+    const int64_t rows = std::min(BAND, p.height - first);
     float* const band = scratch.patch.data() + first * p.pitch;
     for (int64_t j = 0; j < rows; ++j) {
-      const double y = p.top + double(first + j) * p.step;
+      const double y = p.n->top + double(first + j) * p.step;
       sample<degree>(window,
-                     {float(warp.c * p.left + warp.s * y + x0), float(warp.c * y - warp.s * p.left + y0),
+                     {float(warp.c * p.n->left + warp.s * y + x0), float(warp.c * y - warp.s * p.n->left + y0),
                       float(warp.c * p.step), float(-warp.s * p.step), int(p.width)},
                      band + j * p.pitch);
-      fetch(t, p, first + BLOCK + j);
+      fetch(p, first + BAND + j, 3);
     }
-    if (first == 0) scratch.model = expected(t, scratch, whole, anew);
-    products<whole>(t, p, first, rows, band, scratch.model, lines);
-    add_lines(t, p, lines, scratch.sums);
-    if (whole) lines += lines_of(t) * p.pitch;
+    if (first == 0) m.base = band[p.width / 2];  // sums lose little where little is left
+    add_products(t, p, scratch.weights(p), first, rows, band, m.base, scratch.lines.data(), m.sums, m.square);
   }
+  rescale(t, p, m.sums);
 }
 
-// What the fit (Criterion.fit) has more of each column than the model, and the step (Criterion.step).
-inline void fit(const Template& t, const Pixels& p, Scratch& scratch, double (&step)[3]) {
-  const Coefficients& model = scratch.model;
-  Coefficients sums = scratch.sums.z, &change = scratch.change;
+// Criterion.step and Criterion.fit.
+inline void fit(const Template& t, const Pixels& p, const Weighted& w, Model& m) {
+  Coefficients sums = m.sums;
   if (t.criterion >= 0) {
-    change = multiply(p, sums);
-    for (int k = 0; k < 3; ++k) step[k] = change[k] / std::max(scratch.gain(), 0.0);
+    m.fit = multiply(t, w.inverse, sums);
+    for (int k = 0; k < 3; ++k) m.step[k] = m.fit[k] / std::max(m.fit[3], 0.0);
     return;
   }
-  double gain = 1, one = t.whole.level;  // v = t
-  if (t.criterion == PAPER) {            // v less its mean, over t less its mean
-    const double w = p.of_one[4], wt = p.of_level[4], mean = sums[4] / w, known = model[3] * p.contrast;
-    const double both = scratch.sums.r[3] * p.grey - mean * wt;  // what the model leaves, less its mean, times t
-    const double square = scratch.sums.squares - mean * sums[4] + 2 * model[3] * both + known * known;
-    gain = std::sqrt(std::max(square, 0.0)) / std::max(p.contrast, 1e-30);
-    one = model[4] + mean - (gain - model[3]) * wt / w;
+  double gain = 1, offset = p.n->mean[1] - m.base;  // g = t
+  if (t.criterion == PAPER) {                       // g less its mean, over t less its mean
+    const double mean = sums[4] / w.total;
+    gain = std::sqrt(std::max(m.square - mean * sums[4], 0.0)) / std::max(w.contrast, 1e-30);
+    offset = mean - gain * w.along / w.total;
   }
-  change = {0, 0, 0, gain - model[3], one - model[4]};
-  for (int k = 0; k < 3; ++k) sums[k] -= change[3] * p.of_level[k] + change[4] * p.of_one[k];
-  const Coefficients moved = multiply(p, sums);
-  for (int k = 0; k < 3; ++k) step[k] = moved[k] / gain;
+  for (int k = 0; k < 3; ++k) sums[k] -= gain * w.of_t[k] + offset * w.of_one[k];
+  m.fit = multiply(t, w.inverse, sums);
+  for (int k = 0; k < 3; ++k) m.step[k] = m.fit[k] / gain;
+  m.fit = {0, 0, 0, gain, offset};
 }
 
-// solver.gauss_newton after the step is known: secant stretch, update (eq. 10), predicted error.
-inline void advance(const Template& t, const double (&step)[3], State& state) {
-  const double delta[3] = {step[0], step[1], step[2] * t.radius};
-  double length = 0, last = 0, along = 0;
+// solver.advance: accelerated step, update (eq. 10), predicted error.
+inline void advance(double radius, const double (&step)[3], State& state) {
+  const double delta[3] = {step[0], step[1], step[2] * radius}, last = state.length;
+  double length = 0, along = 0;
   for (int k = 0; k < 3; ++k) {
     length += delta[k] * delta[k];
-    last += state.delta[k] * state.delta[k];
     along += state.delta[k] * delta[k];
   }
   length = std::sqrt(length);
-  last = std::sqrt(last);
-  // A first step after another stage is not the next of a series: what share of its way a step covers is known.
-  const bool first = !std::isfinite(state.error);
-  const double ratio = first && state.factor > 1 ? 1 - 1 / state.factor : last > 0 ? length / last : 0.5;
-  const double rate = std::clamp(ratio, 0.05, 0.95);
   along /= last * last;
-  const bool usable = last < SECANT_RANGE && along < 0.9 && std::isfinite(state.error);
-  const double factor = usable ? std::clamp(state.factor / (1 - along), 1.0, LARGEST_STRETCH) : 1.0;
-  const double stretch = std::min(factor, LONGEST_STEP * t.radius / std::max(length, 1e-12));
-  state.pose[2] -= step[2] * stretch;
+  const bool first = !std::isfinite(state.error);
+  const double ratio = first && state.scale > 1 ? 1 - 1 / state.scale : last > 0 ? length / last : 0.5;
+  const double rate = std::clamp(ratio, 0.05, 0.95);
+  const bool usable = last < ECC_SECANT_RANGE && along < 0.9 && !first;
+  const double secant = usable ? std::clamp(state.scale / (1 - along), 1.0, ECC_LARGEST_SCALE) : 1.0;
+  const double scale = length > 0 ? std::min(secant, ECC_LONGEST_STEP * radius / length) : secant;
+  state.pose[2] -= step[2] * scale;
   const double c = std::cos(state.pose[2]), s = std::sin(state.pose[2]);
-  state.pose[0] -= (c * step[0] + s * step[1]) * stretch;
-  state.pose[1] -= (c * step[1] - s * step[0]) * stretch;
+  state.pose[0] -= (c * step[0] + s * step[1]) * scale;
+  state.pose[1] -= (c * step[1] - s * step[0]) * scale;
   std::copy(delta, delta + 3, state.delta);
-  state.factor = stretch;
-  state.error = length * stretch * rate / (1 - rate);
+  state.length = length;
+  state.scale = scale;
+  state.error = length * scale * rate / (1 - rate);
   state.iterations += 1;
 }
 
-// R W R^T u, and R W r, from the column t on, of the last look at a whole template.
-inline double along(const Template& t, int c, const Coefficients& u) {
-  return std::inner_product(u.begin(), u.end(), t.gram[c], 0.0);
-}
-
-inline double along(const Template& t, int c, const Sums& sums) { return c == 4 ? sums.z[4] : sums.r[c] * t.whole.grey; }
-
-// e W e of e = r - R^T change. What e has along G is nothing but chance, as it is nothing along Z; along the other
-// columns it is known. `moved`: the step's part of R^T change alone, squared.
-inline double left_over(const Template& t, const Scratch& scratch, double& moved) {
-  double rest = scratch.sums.squares;
-  moved = 0;
-  for (int c = 0; c < MOST; ++c) {
-    const double taken = along(t, c, scratch.change);
-    rest -= scratch.change[c] * (c < 3 ? taken : 2 * along(t, c, scratch.sums) - taken);
-    if (c < 3) moved += scratch.change[c] * taken;
-  }
-  return std::max(rest, CLEAR * moved);  // never nothing for certain, after a long step
-}
-
-// Whether chance may be much of what is left: in frames with next to no noise, after a step that is not small.
-inline bool vague(const Template& t, const Scratch& scratch) {
-  double moved;
-  return CLEAR * left_over(t, scratch, moved) < moved;
-}
-
-template <int degree, bool whole>
-void iterate(const Template& t, const Frame& frame, double tolerance, int64_t budget, bool last, State& state,
+// solver.iterate. False if the last look saw nothing.
+template <int degree>
+bool iterate(const Template& t, const Pixels& p, const Frame& frame, double tolerance, int64_t most, State& state,
              Scratch& scratch) {
-  const Pixels& p = whole ? t.whole : t.thin;
   state.error = INFINITE;
-  for (int64_t row = 0; row < BLOCK; ++row) fetch(t, p, row);
-  for (int64_t k = 0; k < budget && (state.error > tolerance || (last && vague(t, scratch))); ++k) {
+  for (int64_t row = 0; row < BAND; ++row) fetch(p, row, 3);
+  for (bool anew = true; state.iterations < most && state.error > tolerance; anew = false) {
     const Warp warp = warp_of(state.pose);
-    cover<degree>(t, frame, warp, scratch.window, k == 0);
-    look<degree, whole>(t, warp, state.iterations == 0, scratch);
-    double step[3];
-    fit(t, p, scratch, step);
-    if (!(std::isfinite(step[0]) && std::isfinite(step[1]) && std::isfinite(step[2]))) {
-      state.error = 0;
-      break;
+    Model& m = scratch.model;
+    const bool seen = find<degree>(t, p, frame, warp, anew, scratch);
+    if (seen) {
+      look<degree>(t, p, warp, scratch);
+      fit(t, p, scratch.weighted(p), m);
     }
-    advance(t, step, state);
+    if (!seen || !(std::isfinite(m.step[0]) && std::isfinite(m.step[1]) && std::isfinite(m.step[2]))) {
+      state.error = 0;
+      return seen;
+    }
+    advance(p.n->radius, m.step, state);
   }
+  return true;
 }
 
-// solver.refine. False, with nothing settled, if the template comes so near the frame's border that pixels may drop out.
-inline bool refine(const Template& t, const Frame& frame, const Settings& set, State& state, Scratch& scratch) {
-  int64_t budget = set.max_iterations;
+// solver.solve_at_once. False if the last look saw nothing.
+inline bool solve(const Template& t, const Frame& frame, const Settings& set, State& state, Scratch& scratch) {
+  const int64_t most = set.max_iterations;
   scratch.patch.resize(t.whole.height * t.whole.pitch + LANES);
-  scratch.lines.resize(rows_of_blocks(t.whole) * lines_of(t) * t.whole.pitch);
-  scratch.rest.assign(3 * (t.whole.pitch + BLOCK + t.parts_pitch), 0);
-  scratch.model = scratch.change = {};
-  if (!inside(t, state.pose, frame, EDGE)) return false;
-  if (budget > 1 && (set.degree > 1 || t.thinned)) {
-    const int64_t coarse = std::max<int64_t>(budget * 2 / 3, 1);
-    const double near = std::max(set.tolerance, COARSE_TOLERANCE);
-    if (t.thinned)
-      iterate<1, false>(t, frame, near, coarse, false, state, scratch);
-    else
-      iterate<1, true>(t, frame, near, coarse, false, state, scratch);
-    budget -= coarse;
-    if (!inside(t, state.pose, frame, EDGE)) return false;
+  scratch.lines.assign((MOST + SUMS + 3) * t.whole.line(), 0);
+  scratch.border.of = nullptr;
+  if (most > 1 && (set.degree > 1 || t.coarser)) {
+    const double near = std::max(set.tolerance, ECC_COARSE_TOLERANCE);
+    iterate<1>(t, t.coarser ? t.coarse : t.whole, frame, near, std::max<int64_t>(most * 2 / 3, 1), state, scratch);
   }
-  if (set.degree == 1) iterate<1, true>(t, frame, set.tolerance, budget, true, state, scratch);
-  if (set.degree == 3) iterate<3, true>(t, frame, set.tolerance, budget, true, state, scratch);
-  if (set.degree == 5) iterate<5, true>(t, frame, set.tolerance, budget, true, state, scratch);
-  return inside(t, state.pose, frame, 0);
+  if (set.degree == 1) return iterate<1>(t, t.whole, frame, set.tolerance, most, state, scratch);
+  if (set.degree == 3) return iterate<3>(t, t.whole, frame, set.tolerance, most, state, scratch);
+  return iterate<5>(t, t.whole, frame, set.tolerance, most, state, scratch);
 }
 
 }  // namespace ecc
