@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import Task as RichTask
 from rich.text import Text
 
-from torch_ecc.config import build, read_toml
+from torch_ecc.config import fill, read_toml
 
 INTERRUPTED = 130
 
@@ -81,7 +81,7 @@ def track(config: str | None, size: str | None, polygons: tuple[str, ...], **opt
     values |= {name: value for name, value in options.items() if value is not None and value not in ((), [])}
     if "input" not in values:
         raise ValueError("track: INPUT is missing (a video, a folder or glob of images, a TIFF, .npy, .npz, a camera)")
-    session = Session(build(TrackJob, values, config or "track"))
+    session = Session(fill(TrackJob, values, config or "track"))
     with progress_bar(session.source.name, session.source.length) as advance:
         outcome = session.run(lambda estimate: advance())
     _report(outcome)
@@ -167,7 +167,7 @@ def compare(**options: Any) -> None:
     """
     from torch_ecc.commands import compare as job_of
 
-    job = build(job_of.CompareJob, {name: value for name, value in options.items() if value is not None}, "compare")
+    job = fill(job_of.CompareJob, {name: value for name, value in options.items() if value is not None}, "compare")
     figures = job_of.write(job, job_of.compare(job))
     console.print(job_of.report(figures), markup=False)
     console.print(f"In {job.out}/: comparison.json, comparison.png, errors.csv")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.config import build
+from torch_ecc.config import fill, refuse_unknown
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.pose import transform
 from torch_ecc.records.calibration import Calibration
@@ -91,15 +91,12 @@ class ServoJob:
     @classmethod
     def read(cls, values: Mapping[str, Any], *, folder: Path | str = ".") -> ServoJob:
         """From nested tables. ValueError for whatever does not fit; nothing is rendered."""
-        known = ("align", "control", "belief", *TABLES)
-        for key in values:
-            if key not in known:
-                raise ValueError(f"servo: unknown key {key!r}, known are {', '.join(known)}")
+        refuse_unknown(values, ("align", "control", "belief", *TABLES), "servo")
         for key in ("align", "belief", "start"):
             if key not in values:
                 raise ValueError(f"servo: missing table [{key}]")
-        align, belief = build(Align, values["align"], "[align]"), build(Belief, values["belief"], "[belief]")
-        control = build(Control, values.get("control", {}), "[control]")
+        align, belief = fill(Align, values["align"], "[align]"), fill(Belief, values["belief"], "[belief]")
+        control = fill(Control, values.get("control", {}), "[control]")
         return cls(align, control, belief, read_workcell(values, folder=folder))
 
 
