@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import Field, fields, is_dataclass
 from difflib import get_close_matches
-from inspect import Parameter, signature
+from inspect import Parameter, get_annotations, signature
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -84,9 +84,8 @@ def refuse_unknown(keys: Iterable[str], known: Sequence[str], where: str) -> Non
 
 def _refuse(make: Callable[..., Any], values: Any, errors: list[ErrorDetails], where: str) -> NoReturn:
     """ValueError for the error that says most: a misspelt key before one missing for it, an item before its list."""
-    places = [_place(values, error["loc"]) for error in errors]
-    worst = max(range(len(errors)), key=lambda k: (errors[k]["type"] in UNKNOWN, len(places[k])))
-    error, place, name = errors[worst], places[worst], str(errors[worst]["loc"][-1])
+    error = max(errors, key=lambda e: (e["type"] in UNKNOWN, len(_place(values, e["loc"]))))
+    place, name = _place(values, error["loc"]), str(error["loc"][-1])
     if error["type"] in UNKNOWN:
         refuse_unknown([name], _known(make, place[:-1]), _path(where, place[:-1]))
     if error["type"] == "missing" and name.isidentifier():
@@ -94,7 +93,7 @@ def _refuse(make: Callable[..., Any], values: Any, errors: list[ErrorDetails], w
     if error["type"] == "value_error":
         raise ValueError(f"{_path(where, place)}: {error['ctx']['error']}")
     # A value that is none of several types has an error for each.
-    wanted = dict.fromkeys(_wanted(e) for e, p in zip(errors, places, strict=True) if p == place)
+    wanted = dict.fromkeys(_wanted(e) for e in errors if _place(values, e["loc"]) == place)
     raise ValueError(
         f"{_path(where, place)} must {' or '.join(wanted).replace(' or be ', ' or ')}, got {error['input']!r}"
     )
@@ -133,19 +132,23 @@ def _known(make: Any, place: Iterable[int | str]) -> list[str]:
     return list(signature(make).parameters)
 
 
+def paragraphs(kind: type[Any]) -> list[list[Field[Any]]]:
+    """The settings of a dataclass: its own, then those of each class that it derives from."""
+    settings = {each.name: each for each in fields(kind) if each.init}
+    return [[settings[name] for name in get_annotations(each) if name in settings] for each in kind.__mro__[:-1]]
+
+
 def write_toml(kind: type[Any], values: Mapping[str, Any]) -> str:
-    """Every setting of a dataclass as a line of TOML with its ``help``: the ``values``, and commented out what is left
-    at its default, or what is an example where there is none. A class and what it derives from are a paragraph each."""
-    settings = {field.name: field for field in fields(kind) if field.init}
-    paragraphs = [
-        "\n".join(_line(settings[name], values) for name in vars(each).get("__annotations__", ()) if name in settings)
-        for each in kind.__mro__
-    ]
-    return "\n\n".join(filter(None, paragraphs)) + "\n"
+    """Every setting of a dataclass as a line of TOML with its ``words``: the ``values``, and commented out what is left
+    at its default, or an example where there is none."""
+    return "\n".join("".join(_line(setting, values) for setting in own) for own in paragraphs(kind))
 
 
-def _line(field: Field[Any], values: Mapping[str, Any]) -> str:
-    value = values.get(field.name, field.metadata.get("example", field.default))
-    # JSON's way to write text, numbers, true and lists is TOML's, too.
-    setting = f"{field.name} = {json.dumps(value, ensure_ascii=False)}"
-    return f"{'' if field.name in values else '#'}{setting}".ljust(32) + f"# {field.metadata['help']}"
+def _line(setting: Field[Any], values: Mapping[str, Any]) -> str:
+    example = setting.metadata["example"]
+    value = values.get(setting.name, setting.default if example is None else example)
+    # JSON's way to write text, numbers, true and lists is TOML's, but for one character.
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False).replace("\x7f", "\\u007f")
+    pair = f"{'' if setting.name in values else '#'}{setting.name} = {text}"
+    known = " | ".join(map(json.dumps, setting.metadata.get("known", ())))
+    return f"{pair:<31} # {known}{known and ': '}{setting.metadata['words']}\n"

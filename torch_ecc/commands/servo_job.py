@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ecc.commands.jobs import Align
 from torch_ecc.config import fill, refuse_unknown
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.pose import transform
@@ -52,17 +53,6 @@ def setting(scale: float = 1.0, **changes: Mapping[str, Any]) -> dict[str, Any]:
         name: values.get(name, {}) | dict(changes.get(name, {})) if name != "light" else values[name]
         for name in (*values, *(set(changes) - set(values)))
     }
-
-
-@dataclass(frozen=True)
-class Align:
-    """What is wanted: see configs/servo.toml."""
-
-    desired: tuple[float, float, float]
-    landing: tuple[float, float]
-    size: int = 121
-    out: str = "torch-ecc-servo"
-    overlay: bool = True
 
 
 @dataclass(frozen=True)
