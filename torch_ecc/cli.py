@@ -71,14 +71,14 @@ def track(config: str | None, write_config: str | None, **options: Any) -> None:
     INPUT is a video, a folder or glob of images, a multi-page TIFF, an .npy or .npz stack or a camera index. Repeat
     --center (or --polygon, or --template) for more templates.
     """
-    from torch_ecc.commands.track import Session
-
     values = (read_toml(config) if config else {}) | given(options)
     if write_config is not None:
         write_new(track_toml(values, config or "track"), write_config)
         return
     if "input" not in values:
-        raise ValueError("track: INPUT is missing (a video, a folder or glob of images, a TIFF, .npy, .npz, a camera)")
+        raise ValueError("track: INPUT is missing, and no config names one")
+    from torch_ecc.commands.track import Session
+
     session = Session(fill(TrackJob, values, config or "track"))
     with progress_bar(session.source.name, session.source.length) as advance:
         finished = session.run(lambda estimate: advance())

@@ -69,8 +69,6 @@ def to_motion(table: TrackTable, job: CompareJob) -> Motion:
         pose = torch.cat((um, displacement[:, 2:]), 1)
     else:
         raise ValueError(f"um_per_px: {job.track} has no columns dx_um and dy_um, so the scale is needed, got none")
-    if job.fps is not None and not (math.isfinite(job.fps) and job.fps > 0):
-        raise ValueError(f"fps: expected a rate > 0 in Hz, got {job.fps:g}")
     if job.fps is None and table.time_s is None:
         raise ValueError(f"fps: {job.track} has no column time_s, so the frame rate is needed, got none")
     time = table.frame / job.fps if job.fps is not None else table.time_s

@@ -18,7 +18,7 @@ Point = tuple[float, float]
 class Tracking(Settings):
     """What ``Tracker`` can be told, by the names of its constructor."""
 
-    # The tracker has its own mind about this one: it is neither an option nor a key.
+    # Not among the arguments of Tracker, so neither an option nor a key.
     min_visible: float = field(default=Settings.min_visible, init=False)
     criterion: str = described("ecc", "what is matched; ecc_paper is eq. 9 to the letter", "ecc", "ecc_paper", "ssd")
     illumination: str = described("linear", "of ecc: light across the template; gain is one factor", *ILLUMINATION)
@@ -75,6 +75,10 @@ class TrackJob(Tracking):
         None, "frames per second, adds times; without it, the video's own if it has one", example=100.0
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_rate(self.fps)
+
     def calibration(self) -> Calibration | None:
         """Pixels to micrometres, None if the scale is not given."""
         if self.um_per_px is None:
@@ -101,6 +105,9 @@ class CompareJob:
     exposure_s: float = described(0.0, "exposure of the camera, which averages the motion")
     max_offset_s: float = described(2.0, "how far the two clocks may be apart")
 
+    def __post_init__(self) -> None:
+        _check_rate(self.fps)
+
 
 @dataclass(frozen=True)
 class Align:
@@ -111,3 +118,8 @@ class Align:
     size: int = 121
     out: str = described("torch-ecc-servo", "folder for the outputs")
     overlay: bool = described(True, "write overlay.mp4")
+
+
+def _check_rate(fps: float | None) -> None:
+    if fps is not None and not 0 < fps < math.inf:
+        raise ValueError(f"fps: expected a rate > 0 in Hz, got {fps:g}")

@@ -81,8 +81,6 @@ class Session:
         if self.source.shape != first.shape[-2:]:
             (h, w), (h0, w0) = self.source.shape, first.shape[-2:]
             raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
-        if job.fps is not None and not (math.isfinite(job.fps) and job.fps > 0):
-            raise ValueError(f"fps: expected a rate > 0 in Hz, got {job.fps:g}")
         self.fps = job.fps if job.fps is not None else self.source.fps
 
     def run(self, progress: Callable[[Estimate], None] = lambda estimate: None) -> Finished:
