@@ -45,7 +45,7 @@ def mechanism(folder: Path) -> list[tuple[str, ...]]:
     bodies = truth["bodies"].values()
     outlines = tuple(tuple(map(tuple, body["mask_polygon"])) for body in bodies)
     centers, size, mask = choose_templates(
-        TrackJob("", centers=tuple(tuple(body["centre_px"]) for body in bodies), polygons=outlines)
+        TrackJob(input="", centers=tuple(tuple(body["centre_px"]) for body in bodies), polygons=outlines)
     )
     video = frames(folder)
     track = Tracker(video[0], centers, size, mask=mask).track_sequence(video[1:])

@@ -78,10 +78,9 @@ def test_every_module_has_its_place():
 
 
 def test_import_is_light():
-    """``import torch_ecc`` brings no plotting, no video, no command line."""
-    code = (
-        "import sys, torch_ecc; print([m for m in ('cv2', 'matplotlib', 'PIL', 'click', 'rich') if m in sys.modules])"
-    )
+    """``import torch_ecc`` brings no plotting, no video, no command line, nothing for configurations."""
+    heavy = ["cv2", "matplotlib", "PIL", "click", "rich", "pydantic"]
+    code = f"import sys, torch_ecc; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
 

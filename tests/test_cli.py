@@ -181,7 +181,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(video, tmp_path, monkeypatch
 def test_a_damaged_frame_keeps_what_came_before(tmp_path):
     for k, frame in enumerate(stack()):
         cv2.imwrite(str(tmp_path / f"f{k}.png"), frame if k < 7 else frame[:-1])
-    job = TrackJob(str(tmp_path / "f*.png"), out=str(tmp_path / "o"), centers=((80.0, 60.0),), size=41)
+    job = TrackJob(input=str(tmp_path / "f*.png"), out=str(tmp_path / "o"), centers=((80.0, 60.0),), size=41)
     with pytest.raises(ValueError, match=r"frame 7: .*160 x 119 px"):
         Session(job).run()
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
@@ -195,8 +195,10 @@ def test_a_damaged_frame_keeps_what_came_before(tmp_path):
 def test_interrupting_keeps_what_was_done(tmp_path):
     np.save(tmp_path / "long.npy", np.tile(stack(), (400, 1, 1)))
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "torch_ecc", "track", str(tmp_path / "long.npy")]
-    command += ["--center", "80", "60", "--size", "41", "--out", str(out)]
+    # Where the tests run in the background SIGINT is ignored, and a child inherits that.
+    listening = "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{listening}; runpy.run_module('torch_ecc', run_name='__main__')"]
+    command += ["track", str(tmp_path / "long.npy"), "--center", "80", "60", "--size", "41", "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
     part = out / "track.csv.part"

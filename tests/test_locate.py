@@ -349,7 +349,7 @@ def test_the_command_finds_a_template(video):
 
 
 def job(folder, **options):
-    return TrackJob(str(folder / "video.npy"), out=str(folder / "out"), **options)
+    return TrackJob(input=str(folder / "video.npy"), out=str(folder / "out"), **options)
 
 
 def test_the_command_refuses_what_it_cannot_tell(video):
@@ -367,8 +367,8 @@ def test_the_command_refuses_what_it_cannot_tell(video):
     for message, options in wrong.items():
         with pytest.raises(ValueError, match=message):
             Session(job(folder, **options))
-    doubtful = TrackJob(str(folder / "twins.npy"), template=template)
+    doubtful = TrackJob(input=str(folder / "twins.npy"), template=template)
     with pytest.raises(ValueError, match=r"may be at x=.*, theta=.* or at x=.*a center tells which one is meant"):
         Session(doubtful)
-    told = Session(TrackJob(str(folder / "twins.npy"), template=template, centers=((170.0, 90.0),)))
+    told = Session(TrackJob(input=str(folder / "twins.npy"), template=template, centers=((170.0, 90.0),)))
     assert error(told.tracker.pose, rows((180, 100, 0)))[0] < 0.05

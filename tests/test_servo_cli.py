@@ -93,7 +93,7 @@ def test_interrupting_keeps_what_was_done(tmp_path, monkeypatch):
     [
         ({"control": {"gain": -1.0}}, "gain must be a finite number > 0, got -1.0"),
         ({"control": {"gian": 1.0}}, r"\[control\]: unknown key 'gian' \(did you mean 'gain'\?\)"),
-        ({"sceen": {"kind": "x"}}, "unknown key 'sceen', known are align, control, belief, scene"),
+        ({"sceen": {"kind": "x"}}, r"servo: unknown key 'sceen' \(did you mean 'scene'\?\)"),
         ({"substrate": {"x": {"sped": 1.0}}}, r"\[substrate\]: x: unknown key 'sped'"),
         ({"look": {"scale": -1.0}}, "scale must be > 0"),
         ({"start": {"probe": [900.0, 50.0]}}, "axis 0 reaches from -150 to 150, got position"),

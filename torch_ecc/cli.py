@@ -14,7 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import Task as RichTask
 from rich.text import Text
 
-from torch_ecc.config import build, read_toml
+from torch_ecc.commands.jobs import Align, CompareJob, TrackJob
+from torch_ecc.commands.options import given, options_of, read_polygons, read_size, track_toml, write_new
+from torch_ecc.config import fill, read_toml
 
 INTERRUPTED = 130
 
@@ -40,52 +42,48 @@ def demo(out: str, frames: int) -> None:
     console.print(f"In {out}/: demo.png, and track.png, overlay.mp4, track.csv ... of each method in ecc/ and ssd/")
 
 
-@app.command(context_settings={"show_default": False})
+@app.command()
 @click.argument("input", required=False)
-@click.option(
-    "--center", "centers", nargs=2, type=float, multiple=True, metavar="X Y", help="Centre of a template, px."
-)
-@click.option("--size", metavar="N|WxH", help="Size of the templates, px.")
-@click.option("--polygon", "polygons", multiple=True, metavar="'X,Y X,Y ...'", help="Outline of a template, frame px.")
-@click.option("--reference", help="Image to cut the templates from [default: the first frame].")
-@click.option("--template", multiple=True, help="Image of a template: found anywhere in the first frame, at any angle.")
 @click.option("--config", type=click.Path(), help="TOML file of settings; options given here win.")
-@click.option("--out", help="Folder for the outputs [default: torch-ecc-out].")
-@click.option("--um-per-px", type=float, help="Scale of the camera: adds micrometres.")
-@click.option("--axis-angle-deg", type=float, help="From the camera's axes to the stage's [default: 0].")
-@click.option("--fps", type=float, help="Frames per second: adds times [default: the video's].")
-@click.option("--criterion", help="ecc, ecc_paper or ssd [default: ecc].")
-@click.option("--illumination", help="Light model of ecc: gain, linear or quadratic [default: linear].")
-@click.option("--interpolation", help="bilinear, bspline3 or bspline5 [default: bspline3].")
-@click.option("--max-iterations", type=int, help="Iterations per frame at most [default: 15].")
-@click.option("--tolerance", type=float, help="Remaining error at the template's corner, px [default: 0.001].")
-@click.option("--levels", type=int, help="Pyramid levels, for large motion [default: 1].")
-@click.option("--prediction", help="Start of each frame: hold or velocity [default: velocity].")
-@click.option("--min-score", type=float, help="Below this correlation a template is lost [default: 0.5].")
-@click.option("--search/--no-search", default=None, help="Look for a lost template in the whole frame [default: yes].")
-@click.option("--device", help="cpu, cuda, ... [default: cpu].")
-@click.option("--backend", help="On a CPU: auto, torch or native [default: auto].")
-@click.option("--overlay/--no-overlay", default=None, help="Write overlay.mp4 [default: yes].")
-def track(config: str | None, size: str | None, polygons: tuple[str, ...], **options: Any) -> None:
+@click.option(
+    "--write-config",
+    metavar="[FILE]",
+    is_flag=False,
+    flag_value="-",
+    help="Write all settings, commented, as a file for --config, and do nothing else; without FILE, to the screen.",
+)
+@options_of(
+    TrackJob,
+    without=("input",),
+    centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
+    size={"type": str, "metavar": "N|WxH", "callback": read_size},
+    polygons={
+        "flag": "--polygon",
+        "type": str,
+        "multiple": True,
+        "metavar": "'X,Y X,Y ...'",
+        "callback": read_polygons,
+    },
+)
+def track(config: str | None, write_config: str | None, **options: Any) -> None:
     """Track patches through a video: x, y and theta of each in every frame.
 
     INPUT is a video, a folder or glob of images, a multi-page TIFF, an .npy or .npz stack or a camera index. Repeat
     --center (or --polygon, or --template) for more templates.
     """
-    from torch_ecc.commands.track import Session, TrackJob
-
-    if size is not None:
-        options["size"] = _size(size)
-    options["polygons"] = [_polygon(text) for text in polygons]
-    values = read_toml(config) if config else {}
-    values |= {name: value for name, value in options.items() if value is not None and value not in ((), [])}
+    values = (read_toml(config) if config else {}) | given(options)
+    if write_config is not None:
+        write_new(track_toml(values, config or "track"), write_config)
+        return
     if "input" not in values:
-        raise ValueError("track: INPUT is missing (a video, a folder or glob of images, a TIFF, .npy, .npz, a camera)")
-    session = Session(build(TrackJob, values, config or "track"))
+        raise ValueError("track: INPUT is missing, and no config names one")
+    from torch_ecc.commands.track import Session
+
+    session = Session(fill(TrackJob, values, config or "track"))
     with progress_bar(session.source.name, session.source.length) as advance:
-        outcome = session.run(lambda estimate: advance())
-    _report(outcome)
-    if outcome.interrupted:
+        finished = session.run(lambda estimate: advance())
+    _report(finished)
+    if finished.interrupted:
         sys.exit(INTERRUPTED)
 
 
@@ -145,21 +143,7 @@ def _say_numbers(outcome: Any) -> None:
 @app.command()
 @click.argument("track")
 @click.argument("sensors")
-@click.option("--out", help="Folder for the outputs [default: torch-ecc-comparison].")
-@click.option("--template", type=int, help="Which template of the track [default: 0].")
-@click.option("--um-per-px", type=float, help="Scale of the camera, if the track has no micrometres.")
-@click.option(
-    "--axis-angle-deg", type=float, help="From the track's axes to the stage's, as far as known [default: 0]."
-)
-@click.option("--fps", type=float, help="Frames per second, if the track has no times.")
-@click.option("--flip-theta", is_flag=True, help="The sensors' theta counts the other way (a mirrored view).")
-@click.option(
-    "--fixed-angle", is_flag=True, help="Take the axis angle as given (needed with --lever if only theta moves)."
-)
-@click.option("--scale", is_flag=True, help="Estimate a factor between the records, too.")
-@click.option("--lever", is_flag=True, help="Estimate where the template lies from the sensors' point, too.")
-@click.option("--exposure-s", type=float, help="Exposure of the camera, which averages the motion [default: 0].")
-@click.option("--max-offset-s", type=float, help="How far the two clocks may be apart [default: 2].")
+@options_of(CompareJob, without=("track", "sensors"))
 def compare(**options: Any) -> None:
     """Compare a track.csv with other sensors' record of the same motion, at another rate and untriggered.
 
@@ -167,7 +151,7 @@ def compare(**options: Any) -> None:
     """
     from torch_ecc.commands import compare as job_of
 
-    job = build(job_of.CompareJob, {name: value for name, value in options.items() if value is not None}, "compare")
+    job = fill(CompareJob, given(options), "compare")
     figures = job_of.write(job, job_of.compare(job))
     console.print(job_of.report(figures), markup=False)
     console.print(f"In {job.out}/: comparison.json, comparison.png, errors.csv")
@@ -175,8 +159,7 @@ def compare(**options: Any) -> None:
 
 @app.command()
 @click.argument("config", type=click.Path())
-@click.option("--out", help="Folder for the outputs [default: torch-ecc-servo].")
-@click.option("--overlay/--no-overlay", default=None, help="Write overlay.mp4 [default: yes].")
+@options_of(Align, without=("desired", "landing", "size"))
 def servo(config: str, **options: Any) -> None:
     """Align a probe with a substrate by visual servoing on the simulated workstation (section V).
 
@@ -186,8 +169,7 @@ def servo(config: str, **options: Any) -> None:
     from torch_ecc.commands.servo_job import ServoJob
 
     values = read_toml(config)
-    given = {name: value for name, value in options.items() if value is not None}
-    job = ServoJob.read(values | {"align": values.get("align", {}) | given}, folder=Path(config).parent)
+    job = ServoJob.read(values | {"align": values.get("align", {}) | given(options)}, folder=Path(config).parent)
     with Console(stderr=True).status("teaching the templates") as live:
         run = run_session(job, lambda part, step: live.update(f"{part}  {step}"))
     for line in describe(job, run):
@@ -196,37 +178,19 @@ def servo(config: str, **options: Any) -> None:
         sys.exit(INTERRUPTED if run.alignment.ending.name == "INTERRUPTED" else 1)
 
 
-def _size(text: str) -> int | list[int]:
-    parts = text.lower().split("x")
-    if not (1 <= len(parts) <= 2 and all(part.strip().isdecimal() for part in parts)):
-        raise ValueError(f"size: expected a number of px or WxH, got {text!r}")
-    numbers = [int(part) for part in parts]
-    return numbers[0] if len(numbers) == 1 else numbers[::-1]
-
-
-def _polygon(text: str) -> list[list[float]]:
-    try:
-        corners = [[float(number) for number in corner.split(",")] for corner in text.split()]
-    except ValueError:
-        corners = []
-    if not corners or any(len(corner) != 2 for corner in corners):
-        raise ValueError(f"polygon: expected corners as 'X,Y X,Y ...' in px, got {text!r}")
-    return corners
-
-
-def _report(outcome: Any) -> None:
+def _report(finished: Any) -> None:
     """Say in words what became of a run."""
     from torch_ecc.core.estimate import Status
 
-    for number, lost in enumerate(outcome.lost.tolist()):
+    for number, lost in enumerate(finished.lost.tolist()):
         if lost:
-            sentence = Status.describe(int(outcome.last_status[number]))
+            sentence = Status.describe(int(finished.last_status[number]))
             console.print(
-                f"Template {number} was not found in {lost} of {outcome.frames} frames. Last frame: {sentence}"
+                f"Template {number} was not found in {lost} of {finished.frames} frames. Last frame: {sentence}"
             )
-    end = "Stopped from the keyboard after" if outcome.interrupted else "Tracked"
-    names = ", ".join(sorted(path.name for path in outcome.folder.iterdir())) if outcome.frames else "nothing"
-    console.print(f"{end} {outcome.frames} frames. In {outcome.folder}/: {names}")
+    end = "Stopped from the keyboard after" if finished.interrupted else "Tracked"
+    names = ", ".join(sorted(path.name for path in finished.folder.iterdir())) if finished.frames else "nothing"
+    console.print(f"{end} {finished.frames} frames. In {finished.folder}/: {names}")
 
 
 class _Rate(ProgressColumn):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_ecc.commands.jobs import CompareJob
 from torch_ecc.core.pose import rotation
 from torch_ecc.io.comparison import TrackTable, read_sensors, read_track, write_table
 from torch_ecc.io.output import check_folder, part, publish
@@ -22,31 +22,6 @@ from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
 
 UNITS = {"x_nm": 1e3, "y_nm": 1e3, "theta_urad": 1e6}
 FORMATS = {"frame": "%d", "time_s": "%.6f", "sensor_time_s": "%.6f", "flag": "%s"}
-
-
-@dataclass(frozen=True)
-class CompareJob:
-    """Settings of a comparison, named as the options of ``torch-ecc compare``.
-
-    ``track``: a track.csv; ``sensors``: a CSV with time_s, x_um, y_um and theta_urad, theta_deg or theta_rad.
-    ``um_per_px`` and ``fps`` are needed where the track has no micrometres or no times. ``flip_theta``: the sensors'
-    theta counts the other way (a mirrored view). ``fixed_angle``: ``axis_angle_deg`` is known and not estimated. The
-    last four as in ``synchrony.Unknowns``.
-    """
-
-    track: str
-    sensors: str
-    out: str = "torch-ecc-comparison"
-    template: int = 0
-    um_per_px: float | tuple[float, float] | None = None
-    axis_angle_deg: float = 0.0
-    fps: float | None = None
-    flip_theta: bool = False
-    fixed_angle: bool = False
-    scale: bool = False
-    lever: bool = False
-    exposure_s: float = 0.0
-    max_offset_s: float = 2.0
 
 
 class Comparison(NamedTuple):
@@ -94,8 +69,6 @@ def to_motion(table: TrackTable, job: CompareJob) -> Motion:
         pose = torch.cat((um, displacement[:, 2:]), 1)
     else:
         raise ValueError(f"um_per_px: {job.track} has no columns dx_um and dy_um, so the scale is needed, got none")
-    if job.fps is not None and not (math.isfinite(job.fps) and job.fps > 0):
-        raise ValueError(f"fps: expected a rate > 0 in Hz, got {job.fps:g}")
     if job.fps is None and table.time_s is None:
         raise ValueError(f"fps: {job.track} has no column time_s, so the frame rate is needed, got none")
     time = table.frame / job.fps if job.fps is not None else table.time_s

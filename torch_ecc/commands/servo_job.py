@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.config import build
+from torch_ecc.commands.jobs import Align
+from torch_ecc.config import fill, refuse_unknown
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.pose import transform
 from torch_ecc.records.calibration import Calibration
@@ -55,17 +56,6 @@ def setting(scale: float = 1.0, **changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Align:
-    """What is wanted: see configs/servo.toml."""
-
-    desired: tuple[float, float, float]
-    landing: tuple[float, float]
-    size: int = 121
-    out: str = "torch-ecc-servo"
-    overlay: bool = True
-
-
-@dataclass(frozen=True)
 class Belief:
     """What the controller takes the stages to be like: scale, angle of the axes, the substrate's axis of rotation."""
 
@@ -91,15 +81,12 @@ class ServoJob:
     @classmethod
     def read(cls, values: Mapping[str, Any], *, folder: Path | str = ".") -> ServoJob:
         """From nested tables. ValueError for whatever does not fit; nothing is rendered."""
-        known = ("align", "control", "belief", *TABLES)
-        for key in values:
-            if key not in known:
-                raise ValueError(f"servo: unknown key {key!r}, known are {', '.join(known)}")
+        refuse_unknown(values, ("align", "control", "belief", *TABLES), "servo")
         for key in ("align", "belief", "start"):
             if key not in values:
                 raise ValueError(f"servo: missing table [{key}]")
-        align, belief = build(Align, values["align"], "[align]"), build(Belief, values["belief"], "[belief]")
-        control = build(Control, values.get("control", {}), "[control]")
+        align, belief = fill(Align, values["align"], "[align]"), fill(Belief, values["belief"], "[belief]")
+        control = fill(Control, values.get("control", {}), "[control]")
         return cls(align, control, belief, read_workcell(values, folder=folder))
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -17,57 +16,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_ecc.commands.jobs import TrackJob
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.frame import as_gray
 from torch_ecc.io import OverlayWriter, TrackWriter, open_frames
 from torch_ecc.plots import plot_track
-from torch_ecc.records.calibration import Calibration
 from torch_ecc.search.locate import Located
 from torch_ecc.track.tracker import Tracker
 
 STATUS_NAMES = {int(code): code.name for code in Status}
-Point = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class TrackJob:
-    """Settings of a run, as in configs/track.toml and the options of ``torch-ecc track``.
-
-    ``input``: see ``io.open_frames``; ``reference``: the image to cut the templates from (default: the first frame of
-    the input, which then counts as frame 0); ``template``: images of the templates themselves, all of one size, found
-    anywhere in the first frame (of places that look alike, nearest to ``centers`` if given); ``centers`` and ``size``
-    px as in ``Tracker``; ``polygons``: one list of (x, y) px corners per template instead of, or within, the squares;
-    the other names are ``Tracker``'s and ``Calibration``'s.
-    """
-
-    input: str
-    out: str = "torch-ecc-out"
-    reference: str | None = None
-    template: tuple[str, ...] = ()
-    centers: tuple[Point, ...] = ()
-    size: int | tuple[int, int] | None = None
-    polygons: tuple[tuple[Point, ...], ...] = ()
-    criterion: str = "ecc"
-    illumination: str = "linear"
-    interpolation: str = "bspline3"
-    max_iterations: int = 15
-    tolerance: float = 1e-3
-    levels: int = 1
-    prediction: str = "velocity"
-    min_score: float = 0.5
-    search: bool = True
-    device: str | None = None
-    backend: str = "auto"
-    um_per_px: float | Point | None = None
-    axis_angle_deg: float = 0.0
-    fps: float | None = None
-    overlay: bool = True
-
-    def calibration(self) -> Calibration | None:
-        """Pixels to micrometres, None if the scale is not given."""
-        if self.um_per_px is None:
-            return None
-        return Calibration(self.um_per_px, math.radians(self.axis_angle_deg))
 
 
 class Templates(NamedTuple):
@@ -89,7 +46,7 @@ class Templates(NamedTuple):
         return [self.size] * len(self.centers) if self.mask is None else list(self.mask)
 
 
-class Outcome(NamedTuple):
+class Finished(NamedTuple):
     """What became of a run: ``frames`` done, how many each template was lost in and its last status (R,), the folder,
     and whether it was stopped from the keyboard."""
 
@@ -114,26 +71,19 @@ class Session:
         frames = iter(self.source)
         first = next(frames) if job.reference is None else next(iter(open_frames(job.reference)))
         self.frames = frames if job.reference else chain((first,), frames)
-        names = (
-            "criterion illumination interpolation max_iterations tolerance levels prediction device min_score search"
-            " backend"
-        )
-        options = {name: getattr(job, name) for name in names.split()}
         centers, size, mask = self.templates
         if crops is None:
-            self.tracker = Tracker(first, centers, size, mask=mask, **options)
+            self.tracker = Tracker(first, centers, size, mask=mask, **job.options())
         else:
             near = torch.tensor(job.centers).double() if job.centers else None
-            self.tracker, located = Tracker.find(crops, first, near=near, **options)
+            self.tracker, located = Tracker.find(crops, first, near=near, **job.options())
             refuse_doubt(located, near is not None)
         if self.source.shape != first.shape[-2:]:
             (h, w), (h0, w0) = self.source.shape, first.shape[-2:]
             raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
-        if job.fps is not None and not (math.isfinite(job.fps) and job.fps > 0):
-            raise ValueError(f"fps: expected a rate > 0 in Hz, got {job.fps:g}")
         self.fps = job.fps if job.fps is not None else self.source.fps
 
-    def run(self, progress: Callable[[Estimate], None] = lambda estimate: None) -> Outcome:
+    def run(self, progress: Callable[[Estimate], None] = lambda estimate: None) -> Finished:
         """Track every frame and write DIR/track.csv, track.npz, track.png, summary.json and overlay.mp4.
 
         ``progress`` is told each frame's estimate. Ctrl-C ends the run and keeps what it had; so does a damaged frame,
@@ -163,7 +113,7 @@ class Session:
             plot_track(folder / "track.npz", folder / "track.png", title=self.source.name)
         if isinstance(stopped, ValueError):
             raise stopped
-        return Outcome(done, lost, last, folder, stopped is not None)
+        return Finished(done, lost, last, folder, stopped is not None)
 
     def _writers(self, folder: Path) -> tuple[TrackWriter, OverlayWriter | _NoOverlay]:
         matrix = None

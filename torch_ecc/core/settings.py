@@ -2,33 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from math import inf
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+def described(default: T, words: str, *known: str, example: Any = None) -> T:
+    """A field with what a command line and a configuration file say of it: its ``words``, the values that are
+    ``known`` if it takes no others, and an ``example`` if its default shows nothing."""
+    return field(default=default, metadata={"words": words, "known": known, "example": example})
 
 
 @dataclass(frozen=True)
 class Settings:
     """How to iterate and when to believe the result.
 
-    ``tolerance``: remaining error in px at the template's farthest pixel. A template is lost below ``min_score`` and
-    out of view when less than ``min_visible`` of its weight lies in the frame. ``backend``: "auto" is the native path
-    on a CPU where it is there or can be compiled, "native" says so if it cannot, "torch" never is.
+    A ``backend`` of "auto" is the native path on a CPU where it is there or can be compiled, "native" says so if it
+    cannot, "torch" never is.
     """
 
-    interpolation: str = "bspline3"
-    max_iterations: int = 15
-    tolerance: float = 1e-3
-    min_score: float = 0.5
-    min_visible: float = 0.25
-    backend: str = "auto"
+    interpolation: str = described(
+        "bspline3", "how the frame is read between pixels; bilinear is fast", "bilinear", "bspline3", "bspline5"
+    )
+    max_iterations: int = described(15, "iterations per frame at most")
+    tolerance: float = described(1e-3, "remaining error at the template's farthest pixel, px")
+    min_score: float = described(0.5, "below this correlation a template is lost")
+    min_visible: float = described(0.25, "with less of its weight in the frame a template is out of view")
+    backend: str = described(
+        "auto", "on a CPU; auto is native where that is compiled or can be", "auto", "torch", "native"
+    )
 
     def __post_init__(self) -> None:
-        for name, known in (
-            ("interpolation", ["bilinear", "bspline3", "bspline5"]),
-            ("backend", ["auto", "torch", "native"]),
-        ):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name}: expected one of {known}, got {getattr(self, name)!r}")
+        for each in fields(self):
+            known = each.metadata.get("known")
+            if known and getattr(self, each.name) not in known:
+                raise ValueError(f"{each.name}: expected one of {list(known)}, got {getattr(self, each.name)!r}")
         if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
             raise ValueError(f"max_iterations: expected a whole number of at least 1, got {self.max_iterations}")
         if not 0 < self.tolerance < inf:

@@ -13,6 +13,7 @@ from typing import Any
 
 from torch import Tensor
 
+from torch_ecc.config import as_table, choose, fill, refuse_unknown
 from torch_ecc.sim.camera import motion
 from torch_ecc.sim.camera.camera import Camera
 from torch_ecc.sim.camera.dataset import read_poses
@@ -22,7 +23,6 @@ from torch_ecc.sim.camera.sequence import Sequence, check_inside
 from torch_ecc.sim.camera.still import image_light, image_scene
 from torch_ecc.sim.scene.micrograph import micrograph
 from torch_ecc.sim.scene.scene import Pads, PlaneWaves, Scene, Speckle
-from torch_ecc.sim.settings import choose, fill
 
 SCENES: dict[str, Callable[..., Scene]] = {
     "micrograph": micrograph,
@@ -91,10 +91,7 @@ def from_config(values: Mapping[str, Any], *, folder: Path | str = ".") -> Simul
     ValueError for unknown keys, scenes, lights or motions (with the known ones), values out of range, a missing still,
     and a template that leaves the frame at any pose; no frame is rendered.
     """
-    known = ("seed", "scene", "motion", "light", "camera", "template")
-    for key in values:
-        if key not in known:
-            raise ValueError(f"simulate: unknown key {key!r}, known are {', '.join(known)}")
+    refuse_unknown(values, ("seed", "scene", "motion", "light", "camera", "template"), "simulate")
     folder = Path(folder)
     camera = read_camera(values.get("camera", {}), read_light(values.get("light", []), folder), folder)
     poses = _motion(_table(values, "motion", "harmonic"), camera.size, folder)
@@ -139,24 +136,22 @@ def read_light(values: Any, folder: Path) -> Light | None:
 
 def read_camera(values: Any, light: Light | None, folder: Path) -> Camera:
     """The camera; ``noise_variance`` may stand for ``noise_sigma``, and bits = "float" for None, which TOML has not."""
-    settings = dict(values) if isinstance(values, Mapping) else values
-    if isinstance(settings, dict) and "noise_variance" in settings:
+    settings = dict(as_table(values, "[camera]"))
+    if "noise_variance" in settings:
         if "noise_sigma" in settings:
             raise ValueError("[camera]: give noise_sigma or noise_variance, got both")
         variance = settings.pop("noise_variance")
         if not isinstance(variance, int | float) or isinstance(variance, bool):
             raise ValueError(f"[camera]: noise_variance must be a number, got {variance!r}")
         settings["noise_sigma"] = noise_sigma(variance)
-    if isinstance(settings, dict) and settings.get("bits") == "float":
+    if settings.get("bits") == "float":
         settings["bits"] = None
     return fill(Camera, settings, "[camera]", folder=folder, light=light)
 
 
 def _motion(values: Any, size: tuple[int, int], folder: Path) -> Tensor:
     """The poses in the frame; a key that ends in ``_deg`` gives its angle (the last number of a row) in degrees."""
-    if not isinstance(values, Mapping):
-        raise ValueError(f"[motion] must be a table of settings, got {values!r}")
-    own = {key: value for key, value in values.items() if key in ("center", "lead_in")}
+    own = {key: value for key, value in as_table(values, "[motion]").items() if key in ("center", "lead_in")}
     settings = {k.removesuffix("_deg"): _radians(k, v) for k, v in values.items() if k not in own}
     placement = fill(Placement, own, "[motion]", folder=folder)
     poses = motion.from_rest(choose(MOTIONS, settings, "[motion]", folder=folder), placement.lead_in)

@@ -11,11 +11,11 @@ from typing import Any
 
 from torch import Tensor
 
+from torch_ecc.config import choose, fill
 from torch_ecc.sim.camera.motion import Pose
 from torch_ecc.sim.config import SCENES, read_camera, read_light
 from torch_ecc.sim.scene.probe import Probe
 from torch_ecc.sim.scene.scene import Scene
-from torch_ecc.sim.settings import choose, fill
 from torch_ecc.sim.stage.workstation import Microscope, Mount, Part, Workstation
 
 TABLES = ("scene", "camera", "light", "microscope", "substrate", "probe", "look", "start")
