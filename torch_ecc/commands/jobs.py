@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from torch_ecc.core.criteria import ILLUMINATION
+from torch_ecc.core.criteria import CRITERIA, ILLUMINATION
 from torch_ecc.core.settings import Settings, described
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.track.tracker import PREDICTIONS
@@ -18,13 +18,11 @@ Point = tuple[float, float]
 class Tracking(Settings):
     """What ``Tracker`` can be told, by the names of its constructor."""
 
-    # Not among the arguments of Tracker, so neither an option nor a key.
-    min_visible: float = field(default=Settings.min_visible, init=False)
-    criterion: str = described("ecc", "what is matched; ecc_paper is eq. 9 to the letter", "ecc", "ecc_paper", "ssd")
-    illumination: str = described("linear", "of ecc: light across the template; gain is one factor", *ILLUMINATION)
+    criterion: str = described("ecc", "what is matched; ecc_paper is eq. 9 to the letter", CRITERIA)
+    illumination: str = described("linear", "of ecc: light across the template; gain is one factor", ILLUMINATION)
     levels: int = described(1, "pyramid levels used at once; a template that is not found gets more by itself")
     prediction: str = described(
-        "velocity", "start where the last frame ended (hold) or where its step leads", *PREDICTIONS
+        "velocity", "start where the last frame ended (hold) or where its step leads", PREDICTIONS
     )
     search: bool = described(True, "look for a lost template in the whole frame, at any angle")
     device: str | None = described(None, "without it, the CPU", example="cuda")

@@ -20,22 +20,17 @@ def align(
     reference: Reference,
     image: Tensor,
     pose: Tensor,
-    *,
-    interpolation: str = "bspline3",
-    max_iterations: int = 15,
-    tolerance: float = 1e-3,
-    min_score: float = 0.5,
-    backend: str = "auto",
+    **options: str | float,
 ) -> Estimate:
     """Poses of B prepared templates in their images: (B or 1, 1, H, W), start (B, 3) px, px, rad -> Estimate.
 
     One image serves all templates without copies. ``displacement`` counts from the start pose, which failed elements
-    keep. The options: see settings.Settings. Raises ValueError for bad shapes, dtypes, devices, NaN and unknown
-    options.
+    keep. ``options``: ``interpolation``, ``max_iterations``, ``tolerance``, ``min_score`` ... as in settings.Settings.
+    Raises ValueError for bad shapes, dtypes, devices, NaN and unknown options.
     """
     if not isinstance(reference, Reference):
         raise ValueError(f"align: reference must come from prepare, got {type(reference).__name__}")
-    settings = Settings(interpolation, max_iterations, tolerance, min_score, backend=backend)
+    settings = Settings.of("align", options)
     gray = as_image("align", "image", image)
     pose = require_tensor("align", "pose", pose)
     b, device = len(reference.K), reference.K.device
@@ -51,7 +46,10 @@ def align(
     return solve(reference, gray, pose.to(reference.place.radius.dtype), settings)
 
 
-def solve(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
-    """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype."""
+def solve(
+    reference: Reference, image: Tensor, pose: Tensor, settings: Settings, origin: Tensor | None = None
+) -> Estimate:
+    """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype; ``origin``:
+    what displacements count from, by default the ``pose``."""
     engine = native if native.takes(reference, image, settings) else solver
-    return judge(reference, engine.solve(reference, image, pose, settings), pose, settings)
+    return judge(reference, engine.solve(reference, image, pose, settings), pose, settings, origin)

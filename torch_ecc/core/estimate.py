@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ class Status(IntEnum):
         return _SENTENCES[Status(int(code))]
 
     @staticmethod
-    def good(status: Any) -> Any:
+    def good(status: Tensor) -> Tensor:
         """Which elements of a status tensor (or array) carry a new pose: bool, same shape."""
         return status <= int(Status.MAX_ITERATIONS)
 

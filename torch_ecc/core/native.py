@@ -14,9 +14,9 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -69,27 +69,30 @@ def _code(criterion: Criterion) -> int | None:
 
 
 def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
-    """Poses of B templates in (B or 1, 1, H, W) of one of ``DTYPES`` from ``start`` (B, 3) on, as of ``solver.solve``."""
+    """Poses of B templates in (B or 1, 1, H, W) of one of ``DTYPES`` from ``start`` (B, 3) on: ``solver.solve``."""
     code, degree = _code(reference.criterion), DEGREE[settings.interpolation]
     *values, partial, moments = operator()(
         image, start, *reference.packed, code, degree, settings.max_iterations, settings.tolerance
     )
-    return Solution(*values, _visible(reference, partial, moments) if len(partial) else reference.normal)
+    pose, error, iterations, gain, sums, total = values
+    normal = _visible(reference, partial, moments) if len(partial) else reference.normal
+    return Solution(pose, error, iterations, gain, sums, total, normal)
 
 
 def _visible(reference: Reference, index: Tensor, moments: Tensor) -> Normal:
     """The normal equations with those of the templates at ``index`` (n,) made anew from ``moments`` (n, ...)."""
     most, columns = packed.MOST, reference.K.shape[1]
-    count, *matrices, gram, noise = moments.split((1, most**2, most**2, 16, 8), 1)
-    square = (matrix.view(-1, most, most)[:, :columns, :columns] for matrix in matrices)
-    anew = normal_equations(Moments(count[:, 0], *square, gram.view(-1, 4, 4), noise.view(-1, 2, 4)))
+    number, *matrices, gram, noise = moments.split((1, most**2, most**2, 16, 8), 1)
+    normal, power = (matrix.view(-1, most, most)[:, :columns, :columns] for matrix in matrices)
+    anew = normal_equations(Moments(number[:, 0], normal, power, gram.view(-1, 4, 4), noise.view(-1, 2, 4)))
     return Normal(*(old.index_copy(0, index, new) for old, new in zip(reference.normal, anew, strict=True)))
 
 
 @cache
-def operator() -> Any:
+def operator() -> Callable[..., list[Tensor]]:
     """The operator itself, which takes its time to be found."""
-    return torch.ops.torch_ecc.solve.default
+    solve: Callable[..., list[Tensor]] = torch.ops.torch_ecc.solve.default
+    return solve
 
 
 @lru_cache(maxsize=2)

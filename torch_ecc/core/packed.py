@@ -1,8 +1,8 @@
 """Templates in 16 bits, as a compiled engine reads them: whole rows of pixels, and the numbers that go with them.
 
 All columns of a criterion are made of three images (d/dx, d/dy and t) and the pixels' coordinates, so that with the
-inverse of the normal equations K g = (Z W R^T)^-1 (Z W g) takes 6 bytes per pixel where K takes 4 per column. The images
-were rounded to whole numbers when the template was prepared (``reference.Columns``): nothing is lost here.
+inverse of the normal equations K g = (Z W R^T)^-1 (Z W g) takes 6 bytes per pixel where K takes 4 per column. The
+images were rounded to whole numbers when the template was prepared (``reference.Columns``): nothing is lost here.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ MOST = 10  # columns
 class Packed(NamedTuple):
     """B templates on one grid or two, the coarser one second, of each:
 
-    ``planes`` (B, 7, h, pitch) int16: d/dx, d/dy and t of the instrument, of the signal, and the Wiener weights, 0 where
-    there is no pixel; ``weight`` (B or 1, h or 1, pitch), float32, of one row if all rows of all templates are alike;
+    ``planes`` (B, 7, h, pitch) int16: d/dx, d/dy and t of the instrument, of the signal, and the Wiener weights, 0
+    where there is no pixel; ``weight`` (B or 1, h or 1, pitch), float32, of one row if all rows are alike;
     ``numbers`` (B, ...), float64, in the order of ``Numbers`` in csrc/template.h. ``widths``: columns of the grids;
     ``steps``: px between them.
     """

@@ -15,7 +15,7 @@ from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.pose import pose_dtype
 from torch_ecc.core.reference import MARGIN, SMALLEST, Reference, prepare
 from torch_ecc.core.sampling import pad
-from torch_ecc.core.verdict import pose_covariance
+from torch_ecc.core.verdict import LARGEST_SIGMA, NOISE_SHARE, largest_variance, noise_share, pose_covariance
 
 QUANTISATION = 1 / 12  # variance of rounding to whole grey levels
 
@@ -132,7 +132,8 @@ def texture(
     rounding = 0.0 if require_tensor("texture", "frame", frame).is_floating_point() else QUANTISATION
     variance = sigma.to(patches.centers) ** 2 + rounding
     pose = torch.cat((patches.centers, torch.zeros_like(patches.centers[:, :1])), 1)
-    one = torch.ones_like(variance)
-    covariance, observable = pose_covariance(reference, reference.normal, variance, one, pose)
+    covariance = pose_covariance(reference, reference.normal, variance, torch.ones_like(variance), pose)
     predicted = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    observable = largest_variance(reference, covariance) <= LARGEST_SIGMA**2
+    observable &= noise_share(reference, reference.normal, variance) <= NOISE_SHARE
     return torch.where(observable[:, None], predicted, torch.inf)

@@ -33,7 +33,7 @@ def pose_dtype(device: torch.device | str) -> torch.dtype:
 def rotation(theta: Tensor) -> Tensor:
     """Rotation block of eq. (2): (...) -> (..., 2, 2)."""
     c, s = theta.cos(), theta.sin()
-    return torch.stack((c, s, -s, c), -1).unflatten(-1, (2, 2))
+    return torch.stack((c, s, -s, c), -1).view(*theta.shape, 2, 2)
 
 
 def matrix(pose: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ def retract(pose: Tensor, increment: Tensor) -> Tensor:
 
 
 def ahead(pose: Tensor, step: Tensor) -> Tensor:
-    """``pose`` = last + ``step`` after one more such step in the moving body's own axes, (..., 3), (..., 3) -> (..., 3).
+    """``pose`` = last + ``step`` after one more such step in the moving body's axes: (..., 3), (..., 3) -> (..., 3).
 
     W(pose) o W(last)^-1 o W(pose), exact for a constant turn about any point: the step turns by its own angle.
     """

@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from itertools import chain
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -38,6 +38,9 @@ from torch_ecc.core.noise import (
 from torch_ecc.core.pose import pose_dtype, rotation
 from torch_ecc.core.sampling import SAMPLERS, aliasing, blur, gradients, pad
 
+if TYPE_CHECKING:
+    from torch_ecc.core.packed import Packed
+
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
 ENOUGH = 1500  # pixels of a template tell well where to go; the first iterations leave out others in x and y
 SPARSEST = 4  # px between those that are kept
@@ -46,16 +49,18 @@ PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which
 SMALLEST = 5  # px: side of the smallest template
 LEVELS = 2**15 - 1  # a template is rounded to so many steps on either side: an engine may hold it in 16 bits
 
-Fields = TypeVar("Fields", bound=tuple[Any, ...])
+Fields = TypeVar("Fields", bound=tuple[object, ...])
 
 
 class Grid(NamedTuple):
     """Where the pixels of all templates lie: ``pixels`` (3, N), homogeneous, relative to the middle of the template
-    array; ``box`` (3, 4), the corners of their bounding box; ``block`` (N,), the number of the block that a pixel is
-    in, of ``blocks`` = (rows, columns) of them, of which ``occupied`` hold a pixel."""
+    array; ``box`` (3, 4), the corners of their bounding box, and ``sides`` (2,), how many of them it is wide and high;
+    ``block`` (N,), the number of the block that a pixel is in, of ``blocks`` = (rows, columns) of them, of which
+    ``occupied`` hold a pixel."""
 
     pixels: Tensor
     box: Tensor
+    sides: Tensor
     block: Tensor
     blocks: tuple[int, int]
     occupied: int
@@ -64,11 +69,12 @@ class Grid(NamedTuple):
 class Place(NamedTuple):
     """What the poses of B templates speak of: ``centre`` (B, 2), the point x' = 0 in the grid's coordinates; ``radius``
     (B,) px from there to the farthest pixel; ``lever`` (B, 3): by how many px an increment of 1 in x, y, theta moves
-    that pixel; ``unit`` (B, 2, 3) takes pixels to positions about the centre over half the bounding box."""
+    that pixel, and its square; ``unit`` (B, 2, 3) takes pixels to positions about the centre over half the box."""
 
     centre: Tensor
     radius: Tensor
     lever: Tensor
+    lever2: Tensor
     unit: Tensor
 
 
@@ -86,11 +92,11 @@ class Columns(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Sums over the pixels that count, of which all else that depends on the weights is made: their ``count`` (B,),
+    """Sums over the pixels that count, of which all else that depends on the weights is made: their ``number`` (B,),
     ``normal`` = Z W R^T and ``power`` = Z W (Z W)^T (B, p, p), ``gram`` (B, 4, 4) of {1, u, v, t less its mean} under
     W, and ``noise`` (B, 2, 4) of q {1, x, y, x^2 + y^2} for q the weights times ``wiener``, and for q^2."""
 
-    count: Tensor
+    number: Tensor
     normal: Tensor
     power: Tensor
     gram: Tensor
@@ -98,8 +104,8 @@ class Moments(NamedTuple):
 
 
 class Normal(NamedTuple):
-    """The normal equations of B templates: ``inverse`` (B, p, p) of Z W R^T, zero where it is singular; for the sandwich
-    covariance, each (B, 3, 3), ``bread`` = Z W G^T and ``meat`` = Z W (Z W)^T, both off the other columns, and what
+    """The normal equations of B templates: ``inverse`` (B, p, p) of Z W R^T, zero where it is singular; for the
+    sandwich covariance, each (B, 3, 3), ``bread`` = Z W G^T and ``meat`` = Z W (Z W)^T off the other columns, and what
     white noise of unit variance in the template adds to them (errors in variables), ``bread_bias`` and ``meat_bias``;
     ``noise_share`` (B,): the largest part of the bread that such noise can be, in any direction; ``white`` (B, 3): the
     square sums of the first rows of K; ``total`` (B,) of the weights, and ``freedom`` (B,), the share of it that fitted
@@ -119,11 +125,13 @@ class Normal(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """``level`` (B,): upper estimate of the template's noise, grey levels; ``alias`` (B, samplers, 3, 2): how far
-    aliasing along the template's x and y shifts the pose at most, with each sampler whose own error counts."""
+    """``level`` (B,): upper estimate of the template's noise, grey levels, and ``power`` (B,), its square; ``alias``,
+    of each sampler whose own error counts: (B, 3, 2), by how far aliasing along the template's x and y shifts the pose,
+    rms over the phase."""
 
     level: Tensor
-    alias: Tensor
+    power: Tensor
+    alias: dict[str, Tensor]
 
 
 class _Groups(NamedTuple):
@@ -134,7 +142,7 @@ class _Groups(NamedTuple):
     K: Tensor
     normal: Normal
     noise: Noise
-    coarse: Any  # Reference | None
+    coarse: Reference | None
 
 
 class Reference(_Groups):
@@ -160,7 +168,7 @@ class Reference(_Groups):
         return self.place.unit @ self.grid.pixels
 
     @cached_property
-    def packed(self) -> Any:
+    def packed(self) -> Packed:
         """The templates in 16 bits, for a compiled engine: made once for as long as the reference lives."""
         from torch_ecc.core.packed import pack  # which needs to know what a reference is
 
@@ -175,24 +183,28 @@ class Reference(_Groups):
         """The reference of the templates at ``index`` (n,); of a slice without a copy."""
         if isinstance(index, Tensor) and index.tolist() == list(range(len(self.K))):
             return self
-        return _each(lambda v: v[index], self)
+        return each(lambda v: v[index], self)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
         """``function`` applied to every tensor, ``lambda t: t.to(device)`` for instance."""
-        return _each(function, self, shared=True)
+        return each(function, self, shared=True)
 
 
-def _each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared: bool = False) -> Fields:
+def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared: bool = False) -> Fields:
     """``function`` of the tensors at the same place in nested records; of what all templates share, a Grid, only if
     ``shared``: else it is that of the first, as is whatever is no tensor."""
-    values = []
+    values: list[object] = []
     for value, *more in zip(first, *others, strict=True):
         if isinstance(value, Tensor):
-            value = function(value, *more)
+            values.append(function(value, *more))
+        elif isinstance(value, dict):
+            values.append({name: function(v, *(m[name] for m in more)) for name, v in value.items()})
         elif isinstance(value, tuple) and hasattr(value, "_fields") and (shared or not isinstance(value, Grid)):
-            value = _each(function, value, *more, shared=shared)
-        values.append(value)
-    return type(first)(*values)
+            values.append(each(function, value, *more, shared=shared))
+        else:
+            values.append(value)
+    make: Callable[..., Fields] = type(first)
+    return make(*values)
 
 
 @plain
@@ -227,14 +239,14 @@ def prepare(
 
 
 def _joined(parts: Iterator[Reference], count: int) -> Reference:
-    """One reference of ``count`` templates from those of some after the other, of which never more than one is there."""
+    """One reference of ``count`` templates from those of some after the others, one part at a time."""
     first, done = next(parts), 0
     if len(first.K) == count:
         return first
-    whole = _each(lambda v: v.new_empty(count, *v.shape[1:]), first)
+    whole = each(lambda v: v.new_empty(count, *v.shape[1:]), first)
     for part in chain([first], parts):
         here = slice(done, done + len(part.K))
-        _each(lambda w, p, here=here: w[here].copy_(p), whole, part)
+        each(lambda w, p, here=here: w[here].copy_(p), whole, part)
         done = here.stop
     return whole
 
@@ -265,10 +277,11 @@ def _prepared(criterion: Criterion, gray: Tensor, kept: Tensor, centre: Tensor, 
         torch.cat((counted(slopes) * wiener, counted(soft)), 1),
         torch.cat((counted(gradients(wide)), counted(wide)), 1),
     )._replace(wiener=wiener[:, 0], weight=weight)
-    reference = _solved(criterion, grid, place, columns, Noise(noise, noise))
-    wrong = torch.stack([counted(aliasing(wide, name)) for name, kernel in SAMPLERS.items() if kernel.aliases], 1)
-    alias = (reference.K[:, None, :3] @ wrong.mT).to(place.radius.dtype)
-    reference = reference._replace(noise=Noise(noise, alias))
+    reference = _solved(criterion, grid, place, columns, Noise(noise, noise.to(place.radius.dtype).square(), {}))
+    for name, kernel in SAMPLERS.items():
+        if kernel.aliases:
+            shift = reference.K[:, :3] @ counted(aliasing(wide, name)).mT
+            reference.noise.alias[name] = shift.to(place.radius.dtype) / 2**0.5
     return reference._replace(coarse=_coarser(reference))
 
 
@@ -281,7 +294,9 @@ def _grid(used: Tensor, image: Tensor) -> Grid:
     column, row = ((x - left) / BLOCK).long(), ((y - top) / BLOCK).long()
     blocks = (int(bottom - top) // BLOCK + 1, int(right - left) // BLOCK + 1)
     block = row * blocks[1] + column
-    return Grid(torch.stack((x, y, torch.ones_like(x))), box, block, blocks, int((torch.bincount(block) > 0).sum()))
+    sides = (box[:2, 2] - box[:2, 0] + 1).to(pose_dtype(image.device))
+    pixels, occupied = torch.stack((x, y, torch.ones_like(x))), int((torch.bincount(block) > 0).sum())
+    return Grid(pixels, box, sides, block, blocks, occupied)
 
 
 def _place(grid: Grid, centre: Tensor, weight: Tensor) -> Place:
@@ -290,7 +305,7 @@ def _place(grid: Grid, centre: Tensor, weight: Tensor) -> Place:
     lever = torch.stack((torch.ones_like(radius), torch.ones_like(radius), radius), -1)
     half = (grid.box[:2, 2] - grid.box[:2, 0]).clamp(min=1.0)[:, None] / 2
     one = torch.eye(2, dtype=half.dtype, device=half.device).expand(len(centre), 2, 2)
-    return Place(centre, radius, lever, torch.cat((one, -centre[:, :, None]), -1) / half)
+    return Place(centre, radius, lever, lever.square(), torch.cat((one, -centre[:, :, None]), -1) / half)
 
 
 def _columns(local: Tensor, soft: Tensor, sharp: Tensor) -> Columns:
@@ -324,37 +339,42 @@ def _coarser(reference: Reference) -> Reference | None:
     column, row = (grid.pixels[:2] - grid.box[:2, :1]).long()
     kept = ((column % step == 0) & (row % step == 0)).nonzero()[:, 0]
     grid = grid._replace(pixels=grid.pixels[:, kept], block=grid.block[kept])
-    images = (v[..., kept] for v in columns[:4])
-    subsampled = Columns(*images, columns.unit, columns.level)
-    return _solved(reference.criterion, grid, reference.place, subsampled, reference.noise)
+    signal, instrument, wiener, weight = (v[..., kept] for v in columns[:4])
+    columns = Columns(signal, instrument, wiener, weight, columns.unit, columns.level)
+    return _solved(reference.criterion, grid, reference.place, columns, reference.noise)
 
 
 def _solved(criterion: Criterion, grid: Grid, place: Place, columns: Columns, noise: Noise) -> Reference:
     """A reference with its normal equations."""
-    nothing: Any = None
-    return reweigh(Reference(criterion, grid, place, columns, columns.weight, nothing, noise, None), columns.weight > 0)
+    K, normal = _normal_equations(criterion, grid, place, columns)
+    return Reference(criterion, grid, place, columns, K, normal, noise, None)
 
 
 def reweigh(reference: Reference, visible: Tensor) -> Reference:
     """The reference of which only the pixels ``visible`` (B, N), bool, count: new weight, K and normal equations."""
     columns = reference.columns._replace(weight=reference.columns.weight * visible)
-    R, Z = (reference.criterion.columns(v, reference.uv) for v in (columns.signal, columns.instrument))
-    ZW, dtype = Z * columns.weight[:, None], reference.place.radius.dtype
-    t = columns.signal[:, 3:]
-    shape = torch.cat((torch.ones_like(t), reference.uv, t - t.mean(-1, keepdim=True)), 1).to(dtype)
-    local = reference.grid.pixels[:2] - reference.place.centre[:, :, None]
+    K, normal = _normal_equations(reference.criterion, reference.grid, reference.place, columns)
+    return reference._replace(columns=columns, K=K, normal=normal)
+
+
+def _normal_equations(criterion: Criterion, grid: Grid, place: Place, columns: Columns) -> tuple[Tensor, Normal]:
+    """K (B, p, N) and the normal equations under the columns' weights."""
+    weight, dtype, uv = columns.weight[:, None], place.radius.dtype, place.unit @ grid.pixels
+    R, Z = (criterion.columns(v, uv) for v in (columns.signal, columns.instrument))
+    ZW, t = Z * weight, columns.signal[:, 3:]
+    shape = torch.cat((torch.ones_like(t), uv, t - t.mean(-1, keepdim=True)), 1).to(dtype)
+    local = grid.pixels[:2] - place.centre[:, :, None]
     arms = torch.cat((torch.ones_like(t), local, local.square().sum(1, keepdim=True)), 1)
-    q = (columns.weight * columns.wiener)[:, None]
+    q = weight * columns.wiener[:, None]
     sums = Moments(
         (columns.weight > 0).sum(-1).to(dtype),
         (ZW @ R.mT).to(dtype),
         (ZW @ ZW.mT).to(dtype),
-        (shape * columns.weight[:, None]) @ shape.mT,
+        (shape * weight) @ shape.mT,
         (torch.cat((q, q * q), 1) @ arms.mT).to(dtype),
     )
     normal = normal_equations(sums)
-    K = (normal.inverse @ ZW.to(dtype)).to(R.dtype)
-    return reference._replace(columns=columns, K=K, normal=normal)
+    return (normal.inverse @ ZW.to(dtype)).to(R.dtype), normal
 
 
 def normal_equations(sums: Moments) -> Normal:
@@ -376,9 +396,9 @@ def normal_equations(sums: Moments) -> Normal:
         bread_bias=bread_bias,
         meat_bias=meat_bias,
         noise_share=largest_eigenvalue(bread, bread_bias),
-        white=((inverse @ sums.power) * inverse).sum(-1)[:, :3],
+        white=((inverse @ sums.power) * inverse).sum(-1)[:, :3].clamp(min=1e-30),
         total=total,
-        freedom=total * (sums.count - columns).clamp(min=1) / sums.count.clamp(min=1),
+        freedom=(total * (sums.number - columns).clamp(min=1) / sums.number.clamp(min=1)).clamp(min=1e-30),
         energy=(sums.gram[:, 3, 3] - along * along / total.clamp(min=1e-30)).clamp(min=0),
         gram=sums.gram,
     )

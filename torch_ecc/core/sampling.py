@@ -159,9 +159,8 @@ def make_sampler(interpolation: str, image: Tensor, warp: Tensor, box: Tensor, l
     corners = warp @ box.to(warp.dtype)
     low, high = corners.amin(-1), corners.amax(-1)
     kept = [torch.minimum(v.clamp(min=0), most) for v in (low - MARGIN_KEPT, high + MARGIN_KEPT)]
-    if last is not None and (
-        last.values.shape[-2:] == (h + 2 * kernel.ring, w + 2 * kernel.ring) or last.covers(*kept)
-    ):
+    whole = h + 2 * kernel.ring, w + 2 * kernel.ring
+    if last is not None and (last.values.shape[-2:] == whole or last.covers(*kept)):
         return last
     low, high = low.nan_to_num().floor() - kernel.radius, high.nan_to_num().ceil() + kernel.radius
     side = -(-(int((high - low).max()) + 1) // 8) * 8  # few different sizes, so that the prefilter matrices are reused
@@ -242,14 +241,15 @@ def prefilter(image: Tensor, interpolation: str, ring: int = 0) -> Tensor:
 @torch.inference_mode(False)
 def _prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, device: torch.device) -> Tensor:
     inverse = torch.linalg.inv(_band(n, taps, 1, torch.device("cpu")))
-    return inverse[_mirror(torch.arange(-ring, n + ring, device="cpu"), n)].to(device, torch.float32)
+    extended: Tensor = inverse[_mirror(torch.arange(-ring, n + ring, device="cpu"), n)]
+    return extended.to(device, torch.float32)
 
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _slope_matrix(n: int, device: torch.device) -> Tensor:
     cpu = torch.device("cpu")
-    slope = _band(n, SLOPE, -1, cpu) @ torch.linalg.inv(_band(n, SAMPLERS["bspline3"].taps, 1, cpu))
+    slope: Tensor = _band(n, SLOPE, -1, cpu) @ torch.linalg.inv(_band(n, SAMPLERS["bspline3"].taps, 1, cpu))
     return slope.to(device, torch.float32)
 
 

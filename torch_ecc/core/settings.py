@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields
+from difflib import get_close_matches
 from math import inf
-from typing import Any, TypeVar
+from typing import Self, TypeVar
+
+from torch_ecc.core.sampling import SAMPLERS
 
 T = TypeVar("T")
 
 
-def described(default: T, words: str, *known: str, example: Any = None) -> T:
+def described(default: T, words: str, known: Collection[str] = (), example: object = None) -> T:
     """A field with what a command line and a configuration file say of it: its ``words``, the values that are
     ``known`` if it takes no others, and an ``example`` if its default shows nothing."""
     return field(default=default, metadata={"words": words, "known": known, "example": example})
@@ -23,16 +27,25 @@ class Settings:
     cannot, "torch" never is.
     """
 
-    interpolation: str = described(
-        "bspline3", "how the frame is read between pixels; bilinear is fast", "bilinear", "bspline3", "bspline5"
-    )
+    interpolation: str = described("bspline3", "how the frame is read between pixels; bilinear is fast", SAMPLERS)
     max_iterations: int = described(15, "iterations per frame at most")
     tolerance: float = described(1e-3, "remaining error at the template's farthest pixel, px")
     min_score: float = described(0.5, "below this correlation a template is lost")
     min_visible: float = described(0.25, "with less of its weight in the frame a template is out of view")
     backend: str = described(
-        "auto", "on a CPU; auto is native where that is compiled or can be", "auto", "torch", "native"
+        "auto", "on a CPU; auto is native where that is compiled or can be", ("auto", "torch", "native")
     )
+
+    @classmethod
+    def of(cls, where: str, options: dict[str, str | float]) -> Self:
+        """The settings of a function's keyword arguments. ValueError, which names ``where``, for an unknown one."""
+        known = [each.name for each in fields(cls)]
+        for name in options:
+            if name not in known:
+                close = get_close_matches(name, known, 1)
+                hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
+                raise ValueError(f"{where}: unknown option {name!r} ({hint})")
+        return cls(**options)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         for each in fields(self):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_ecc.core.criteria import centred
 from torch_ecc.core.pose import retract
-from torch_ecc.core.reference import Normal, Reference, reweigh
+from torch_ecc.core.reference import Normal, Reference, each, reweigh
 from torch_ecc.core.sampling import Sampler, host_looks, inside, make_sampler
 from torch_ecc.core.settings import Settings
 
@@ -29,20 +29,22 @@ FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 
 class Solution(NamedTuple):
     """What an engine answers with, of B templates: ``pose`` (B, 3); ``error`` (B,), the predicted remaining error in px
-    at the farthest pixel; ``iterations`` (B,); the patch's ``gain`` (B,); ``sums`` (B, 10, blocks) of its last look, in
-    every block of pixels, the rows of ``summed``; and the ``normal`` equations of the pixels that it then saw."""
+    at the farthest pixel; ``iterations`` (B,); of the last look the patch's ``gain`` (B,), ``sums`` (B, 10, blocks), in
+    every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 3) over the blocks with that of the squares
+    of the last three, and the ``normal`` equations of the pixels in sight. A gain or total not finite is 0."""
 
     pose: Tensor
     error: Tensor
     iterations: Tensor
     gain: Tensor
     sums: Tensor
+    total: Tensor
     normal: Normal
 
 
 class State(NamedTuple):
     """Of B templates: ``pose`` (B, 3), the last increment ``delta`` (B, 3) in px at the farthest pixel, its ``length``
-    (B,) and the ``scale`` (B,) of the step taken, the predicted remaining ``error`` (B,) in px there, ``iterations``."""
+    (B,), the ``scale`` (B,) of the step taken, the predicted remaining ``error`` (B,) in px there, ``iterations``."""
 
     pose: Tensor
     delta: Tensor
@@ -69,8 +71,7 @@ def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings
     parts = [slice(k, k + some) for k in range(0, many, some)]
     views = [image if len(image) == 1 else image[part] for part in parts]
     found = [solve_at_once(reference.select(p), v, start[p], settings) for p, v in zip(parts, views, strict=True)]
-    *values, normals = zip(*found, strict=True)
-    return Solution(*map(torch.cat, values), Normal(*map(torch.cat, zip(*normals, strict=True))))
+    return each(lambda *values: torch.cat(values), *found)
 
 
 def solve_at_once(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
@@ -81,8 +82,7 @@ def solve_at_once(reference: Reference, image: Tensor, start: Tensor, settings: 
         near = max(settings.tolerance, COARSE_TOLERANCE)
         state, _, _ = iterate(coarse, image, "bilinear", state, near, max(most * 2 // 3, 1))
     state, g, weighed = iterate(reference, image, settings.interpolation, state, settings.tolerance, most)
-    gain, sums = summed(weighed, g)
-    return Solution(state.pose, state.error, state.iterations, gain, sums, weighed.normal)
+    return Solution(state.pose, state.error, state.iterations, *summed(weighed, g), weighed.normal)
 
 
 def iterate(
@@ -110,7 +110,7 @@ def iterate(
 
 
 def look(sample: Sampler, warp: Tensor, pixels: Tensor, last: Tensor | None, busy: Tensor) -> Tensor:
-    """The patches (B, N) at ``warp`` (B, 2, 3); on a CPU those of templates that are not ``busy`` (B,) stay as they were."""
+    """The patches (B, N) at ``warp`` (B, 2, 3); on a CPU those of templates not ``busy`` (B,) stay as they were."""
     if last is None or not host_looks(warp.device) or busy.all():
         return sample(warp, pixels)
     index = busy.nonzero()[:, 0]
@@ -148,8 +148,8 @@ def secant(state: State, delta: Tensor, length: Tensor) -> tuple[Tensor, Tensor]
     return torch.where(usable, (state.scale / (1 - along)).clamp(1.0, LARGEST_SCALE), 1.0), rate
 
 
-def summed(reference: Reference, g: Tensor) -> tuple[Tensor, Tensor]:
-    """Gain (B,) and sums (B, 10, blocks) of patches g (B, N), over the pixels of each block, of the weights w times
+def summed(reference: Reference, g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gain, sums and total of patches g (B, N), see ``Solution``: over the pixels of each block, of the weights w times
 
         1, g0, g0^2, t0 g0, u g0, v g0, e^2, and of the first three rows of K times e,
 
@@ -160,8 +160,9 @@ def summed(reference: Reference, g: Tensor) -> tuple[Tensor, Tensor]:
     (g0, norm), (t0, _) = centred(g, w), centred(reference.signal[:, 3], w)
     g0 = torch.where((norm * norm > FLAT * (w * g * g).sum(-1))[:, None], g0, 0.0)
     wg, (u, v) = w * g0, reference.uv.unbind(1)
-    rows = [w.expand_as(g), wg, wg * g0, wg * t0, wg * u, wg * v, w * residual * residual]
-    rows = torch.cat((torch.stack(rows, 1), reference.K[:, :3] * residual[:, None]), 1)
-    grid = reference.grid
-    sums = rows.new_zeros(len(g), rows.shape[1], grid.blocks[0] * grid.blocks[1])
-    return gain.to(reference.place.radius.dtype), sums.index_add_(2, grid.block, rows)
+    each = torch.stack((w, wg, wg * g0, wg * t0, wg * u, wg * v, w * residual * residual), 1)
+    rows = torch.cat((each, reference.K[:, :3] * residual[:, None]), 1)
+    grid, dtype = reference.grid, reference.place.radius.dtype
+    sums = rows.new_zeros(len(g), rows.shape[1], grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
+    total = torch.cat((sums.sum(-1, dtype=dtype), sums[:, 7:].to(dtype).square().sum(-1)), 1)
+    return gain.to(dtype).nan_to_num_(0.0, 0.0, 0.0), sums, total.nan_to_num_(0.0, 0.0, 0.0)

@@ -1,4 +1,7 @@
-"""The verdict: score, covariance and status of solved templates, from the sums of their last look, for every engine."""
+"""The verdict: score, covariance and status of solved templates, from the sums of their last look, for every engine.
+
+It is made for every frame, of few numbers: what can be known before is, and on a CPU what nobody needs is left out.
+"""
 
 from __future__ import annotations
 
@@ -20,68 +23,88 @@ NOISE_SHARE = 0.6  # of the information in some direction is the template's nois
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 DOUBTFUL_SHARE = 0.5  # of the information, as the likely reason why a template was not found
 PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light is rounding
+LEAST = 1e-30  # what is divided by is at least so much
+
+# The tests of ``decide`` in their order, and what the first one that fails tells.
+VERDICTS = (
+    Status.OUT_OF_VIEW,  # too little of the template's weight lies in the frame
+    Status.LOST,  # it does not look like the template
+    Status.LOST,  # it looks like its negative
+    Status.LOW_TEXTURE,  # the pose is not observable: sigma is too large
+    Status.LOW_TEXTURE,  # or is what the template's own noise makes it
+    Status.MAX_ITERATIONS,  # it was still moving
+    Status.CONVERGED,  # no test fails
+)
 
 
-def judge(reference: Reference, found: Solution, start: Tensor, settings: Settings) -> Estimate:
-    """The record of B solved templates; failed ones get their ``start`` (B, 3) back."""
-    normal, noise_model, pose = found.normal, reference.noise, found.pose
-    sums = found.sums.sum(-1, dtype=pose.dtype).nan_to_num(0.0, 0.0, 0.0)
-    gain = found.gain.nan_to_num(0.0, 0.0, 0.0)
-    clustered = torch.linalg.vecdot(*2 * [found.sums[:, 7:]]).to(pose.dtype)
-    match = score = correlation(normal, sums)
-    if not host_looks(pose.device) or min(score.tolist()) < settings.min_score:
-        match = torch.maximum(score, detrended(normal, sums))  # light alone must not make a stranger of the template
-    square = gain * gain
-    # One image's noise: of the residuals' mean square the template's share is gain^2 v and the frame's, sampled, NG v.
-    variance = sums[:, 6] / (normal.freedom * (square + SAMPLERS[settings.interpolation].noise_gain)).clamp(min=1e-30)
-    scatter = cluster_robust(reference, normal, clustered / (1 + square)[:, None], variance)
+def judge(
+    reference: Reference, found: Solution, start: Tensor, settings: Settings, origin: Tensor | None = None
+) -> Estimate:
+    """The record of B solved templates; failed ones get their ``start`` (B, 3) back. ``displacement`` counts from
+    ``origin`` (B, 3), by default the start."""
+    normal, total, pose = found.normal, found.total, found.pose
+    looks = host_looks(pose.device)
+    match = score = correlation(normal, total)
+    if not looks or min(score.tolist()) < settings.min_score:
+        match = torch.maximum(score, detrended(normal, total))  # light alone must not make a stranger of the template
+    power, error = found.gain.square(), total[:, 6]
+    # One image's noise v: of the residuals' mean square the template's part is gain^2 v, the frame's, sampled, NG v.
+    variance = error / (power + SAMPLERS[settings.interpolation].noise_gain).mul_(normal.freedom)
+    scatter = cluster_robust(reference, normal, total[:, 10:] / (1 + power).unsqueeze(1), variance)
     alias = interpolation_error(reference, pose, settings.interpolation)
-    covariance, observable = pose_covariance(reference, normal, variance, square, pose, scatter, alias)
-    status = decide(
-        normal.total >= settings.min_visible * reference.normal.total,
-        (match >= settings.min_score) & (gain > 0),
-        observable,
-        found.error <= settings.tolerance,
-        noise_model.level.square() * reference.normal.noise_share > DOUBTFUL_SHARE,
-    )
-    good = Status.good(status)
-    pose = torch.where(good[:, None], pose, start)
-    covariance = torch.where(good[:, None, None], covariance, _unknown(pose.dtype, pose.device))
-    rms = (sums[:, 6] / normal.total.clamp(min=1e-30)).clamp(min=0).sqrt()
-    return Estimate(pose, pose - start, score, status, found.iterations, covariance, rms)
+    covariance = pose_covariance(reference, normal, variance, power, pose, scatter, alias)
+    visible = torch.ones_like(score) if normal is reference.normal else normal.total / reference.normal.total
+    unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
+    status = decide(torch.stack((visible, match, found.gain, *unobservable, found.error, score), 1), settings)
+    rms = (error / normal.total.clamp(min=LEAST)).sqrt()
+    if not looks or max(status.tolist()) > Status.MAX_ITERATIONS:
+        textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
+        low = textureless & ((status == Status.LOST) | (status == Status.OUT_OF_VIEW))
+        status = torch.where(low, int(Status.LOW_TEXTURE), status).to(torch.int8)
+        good = Status.good(status)
+        pose = torch.where(good[:, None], pose, start)
+        covariance = torch.where(good[:, None, None], covariance, _unknown(pose.dtype, pose.device))
+    moved = pose - (start if origin is None else origin)
+    return Estimate(pose, moved, score, status, found.iterations, covariance, rms)
 
 
-def decide(visible: Tensor, similar: Tensor, observable: Tensor, converged: Tensor, textureless: Tensor) -> Tensor:
-    """Status codes (B,) int8, from (B,) bool each: enough of a template is ``visible``, it looks ``similar``, its
-    texture makes the pose ``observable``, the iterations have ``converged``, it is ``textureless`` from the start."""
-    codes = _codes(converged.device)
-    status = torch.where(converged, codes[Status.CONVERGED], codes[Status.MAX_ITERATIONS])
-    status = torch.where(observable, status, codes[Status.LOW_TEXTURE])
-    status = torch.where(similar, status, codes[Status.LOST])
-    status = torch.where(visible, status, codes[Status.OUT_OF_VIEW])
-    return torch.where(textureless & ~(similar & visible), codes[Status.LOW_TEXTURE], status)  # that is why
+def decide(amounts: Tensor, settings: Settings) -> Tensor:
+    """Status codes (B,) int8 from the ``amounts`` (B, 7) that each of ``VERDICTS`` is about, the last any number."""
+    sign, limit, codes = _limits(settings, amounts.dtype, amounts.device)
+    first = (amounts * sign >= limit).to(torch.int8).argmin(1)  # NaN passes nothing
+    return codes[first]
 
 
-def correlation(normal: Normal, sums: Tensor) -> Tensor:
-    """Zero-mean normalised correlation (B,) from the sums (B, 10) of ``solver.summed``; 0 where either is flat."""
-    tiny = torch.finfo(sums.dtype).tiny
-    return (sums[:, 3] * (sums[:, 2] * normal.energy).clamp(min=tiny).rsqrt()).clamp(-1, 1)
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Which way each amount counts, how much it has to be at least, and the status codes, (7,) each."""
+    least = settings.min_visible, settings.min_score, torch.finfo(dtype).tiny
+    most = LARGEST_SIGMA**2, NOISE_SHARE, settings.tolerance
+    limit = torch.tensor([*least, *(-m for m in most), inf], dtype=dtype, device=device)
+    sign = torch.tensor([1, 1, 1, -1, -1, -1, 1], dtype=dtype, device=device)
+    return sign, limit, torch.tensor(VERDICTS, dtype=torch.int8, device=device)
 
 
-def detrended(normal: Normal, sums: Tensor) -> Tensor:
+def correlation(normal: Normal, total: Tensor) -> Tensor:
+    """Zero-mean normalised correlation (B,) from the sums (B, ...) of ``solver.summed``; 0 where either is flat."""
+    power = (total[:, 2] * normal.energy).clamp_(min=torch.finfo(total.dtype).tiny)
+    return (total[:, 3] * power.rsqrt_()).clamp_(-1, 1)
+
+
+def detrended(normal: Normal, total: Tensor) -> Tensor:
     """The same off the planes 1, u, v in template and patch: unlike ``correlation`` it does not change in light that
     varies across the template."""
     planes, along = normal.gram[:, :3, :3], normal.gram[:, :3, 3:]
-    both = torch.cat((along, sums[:, [1, 4, 5], None]), -1)
+    both = torch.cat((along, torch.stack((total[:, 1], total[:, 4], total[:, 5]), 1)[:, :, None]), -1)
     power = both.mT @ safe_inverse(planes)[0] @ both  # of both in the planes, (B, 2, 2)
-    tt, gg, tg = normal.gram[:, 3, 3] - power[:, 0, 0], sums[:, 2] - power[:, 1, 1], sums[:, 3] - power[:, 0, 1]
-    solid = (tt > PLANAR * normal.energy) & (gg > PLANAR * sums[:, 2])
+    tt, gg, tg = normal.gram[:, 3, 3] - power[:, 0, 0], total[:, 2] - power[:, 1, 1], total[:, 3] - power[:, 0, 1]
+    solid = (tt > PLANAR * normal.energy) & (gg > PLANAR * total[:, 2])
     return torch.where(solid, tg * (tt * gg).clamp(min=torch.finfo(tg.dtype).tiny).rsqrt(), 0.0).clamp(-1, 1)
 
 
 def cluster_robust(reference: Reference, normal: Normal, clustered: Tensor, variance: Tensor) -> Tensor:
-    """Standard deviations (B, 3) that each row of K gives to noise of the given ``variance`` (B,), over those that it
-    would give to white noise of variance 1; never less than for white noise.
+    """Variance (B, 3) of the noise as each row of K feels it; never less than the ``variance`` (B,) of white noise.
 
     What no noise model knows (edges that the sampler rounds, light, an occluder, blur) leaves residuals that cling
     together where the gradients are. Their effect summed block by block, its squares ``clustered`` (B, 3), tells the
@@ -89,9 +112,9 @@ def cluster_robust(reference: Reference, normal: Normal, clustered: Tensor, vari
     """
     blocks, columns = reference.grid.occupied, reference.K.shape[1]
     if blocks < FEW_BLOCKS * columns:  # too few to tell a scatter from
-        return variance[:, None].sqrt().expand(-1, 3)
+        return variance.unsqueeze(1)
     free = blocks / (blocks - columns)  # blocks are not free: the fit has made their sum zero
-    return torch.maximum(free * clustered / normal.white.clamp(min=1e-30), variance[:, None]).sqrt()
+    return torch.maximum(clustered.div_(normal.white).mul_(free), variance.unsqueeze(1))
 
 
 def interpolation_error(reference: Reference, pose: Tensor, interpolation: str) -> Tensor | None:
@@ -102,54 +125,62 @@ def interpolation_error(reference: Reference, pose: Tensor, interpolation: str) 
     cancel: the mean of exp(2 pi i k step) over n neighbours k is sin(pi n step) / (n sin(pi step)) but for its phase
     (Dirichlet). The shift is ``Noise.alias`` times the sine of the phase, whose mean square is one half.
     """
-    names = [name for name, kernel in SAMPLERS.items() if kernel.aliases]
-    if interpolation not in names:
+    alias = reference.noise.alias.get(interpolation)
+    if alias is None:
         return None
-    step = torch.stack((pose[:, 2].cos(), pose[:, 2].sin()), -1)
-    step = step - step.round()
-    box = reference.grid.box
-    coherent = (torch.sinc((box[:2, 2] - box[:2, 0] + 1) * step) / torch.sinc(step)).prod(-1)
-    return reference.noise.alias[:, names.index(interpolation)] * (coherent / 2**0.5)[:, None, None]
+    step = torch.stack((pose[:, 2].cos(), pose[:, 2].sin()), 1)
+    step -= step.round()
+    coherent = torch.sinc(step * reference.grid.sides).div_(torch.sinc(step)).prod(1)
+    return alias * coherent[:, None, None]
 
 
 def pose_covariance(
     reference: Reference,
     normal: Normal,
     variance: Tensor,
-    square: Tensor,
+    power: Tensor,
     pose: Tensor,
     scatter: Tensor | None = None,
     alias: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of ``variance`` (B,), the patch the
-    ``square`` (B,) of its gain times the template's power; and whether the texture makes the pose observable, (B,).
+    ``power`` (B,) of its gain squared.
 
     Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T, turned from the
     template's axes to the frame's. The template's noise is taken out of S, and out of P for its own part P_t: a
-    derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 3): see
+    derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 1 or 3): see
     ``cluster_robust``, by default white; ``alias`` (B, 3, 2): see ``interpolation_error``.
     """
-    own = torch.minimum(variance, reference.noise.level.to(variance.dtype).square())
-    bias, frame = own[:, None, None], (1 + 1 / square.clamp(min=1e-12))[:, None, None]
-    bread = torch.linalg.inv_ex(normal.bread - bias * normal.bread_bias)[0]
-    meat = frame * normal.meat - bias * normal.meat_bias
-    scatter = variance.sqrt()[:, None] if scatter is None else scatter
+    bias = torch.minimum(variance, reference.noise.power)[:, None, None]
+    both = (1 + 1 / power.clamp(min=1e-12))[:, None, None]
+    bread = torch.linalg.inv_ex(torch.addcmul(normal.bread, bias, normal.bread_bias, value=-1))[0]
+    meat = torch.addcmul(both * normal.meat, bias, normal.meat_bias, value=-1)
     turn = _turn(pose[:, 2])
-    bread = torch.bmm(turn, scatter[:, :, None] * bread)
+    scale = (variance.unsqueeze(1) if scatter is None else scatter).sqrt().unsqueeze(2)
+    bread = torch.bmm(turn, scale * bread)
     covariance = torch.bmm(torch.bmm(bread, meat), bread.mT)
-    if alias is not None:
-        alias = torch.bmm(turn, alias)
-        covariance = torch.baddbmm(covariance, alias, alias.mT)
-    variances = covariance.diagonal(dim1=1, dim2=2)
-    corner = (variances * reference.place.lever.square()).sum(-1)
-    return covariance, (corner < LARGEST_SIGMA**2) & (own * normal.noise_share < NOISE_SHARE)
+    if alias is None:
+        return covariance
+    alias = torch.bmm(turn, alias)
+    return torch.baddbmm(covariance, alias, alias.mT)
+
+
+def largest_variance(reference: Reference, covariance: Tensor) -> Tensor:
+    """Variance (B,) of the farthest pixel's place, px^2."""
+    return (covariance.diagonal(dim1=1, dim2=2) * reference.place.lever2).sum(1)
+
+
+def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = None) -> Tensor:
+    """The largest part (B,) of the information in any direction that the template's noise can be, whose variance is at
+    most ``variance`` (B,); infinite or NaN where the texture leaves a direction open."""
+    power = reference.noise.power
+    return normal.noise_share * (power if variance is None else torch.minimum(power, variance))
 
 
 def _turn(theta: Tensor) -> Tensor:
     """From the template's axes x', y', theta to the frame's: (B, 3, 3)."""
-    c, s = theta.cos(), theta.sin()
-    none, one = torch.zeros_like(c), torch.ones_like(c)
-    return torch.stack((c, s, none, -s, c, none, none, none, one), -1).view(-1, 3, 3)
+    c, s, none = theta.cos(), theta.sin(), torch.zeros_like(theta)
+    return torch.stack((c, s, none, -s, c, none, none, none, none + 1), 1).view(-1, 3, 3)
 
 
 @lru_cache(maxsize=16)
@@ -157,10 +188,3 @@ def _turn(theta: Tensor) -> Tensor:
 def _unknown(dtype: torch.dtype, device: torch.device) -> Tensor:
     """The covariance of what was not found."""
     return torch.diag(torch.full((3,), inf, dtype=dtype, device=device))
-
-
-@lru_cache(maxsize=16)
-@torch.inference_mode(False)
-def _codes(device: torch.device) -> tuple[Tensor, ...]:
-    """Every status as a tensor, so that the host need not hand them over in every frame."""
-    return torch.tensor(list(Status), dtype=torch.int8, device=device).unbind()

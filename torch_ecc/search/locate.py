@@ -8,7 +8,7 @@ the template's ``details`` are searched for at full resolution as well.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -80,20 +80,16 @@ class Located(NamedTuple):
 def locate(
     reference: Reference,
     image: Tensor,
-    *,
-    interpolation: str = "bspline3",
-    max_iterations: int = 15,
-    tolerance: float = 1e-3,
-    min_score: float = 0.5,
+    **options: str | float,
 ) -> Located:
     """Poses of B prepared templates anywhere in their images, (B or 1, 1, H, W), at any angle -> Located.
 
-    At least 0.4 of a template must lie in the frame. For many frames make a ``Locator`` once. Raises ValueError for
-    bad shapes, dtypes, devices, NaN and unknown options.
+    At least 0.4 of a template must lie in the frame. For many frames make a ``Locator`` once. ``options``: of the last
+    refinement, as in settings.Settings. Raises ValueError for bad shapes, dtypes, devices, NaN and unknown options.
     """
     if not isinstance(reference, Reference):
         raise ValueError(f"locate: reference must come from prepare, got {type(reference).__name__}")
-    settings = Settings(interpolation, max_iterations, tolerance, min_score, LEAST_SEEN)
+    settings = Settings.of("locate", {"min_visible": LEAST_SEEN, **options})
     gray = as_gray("locate", "image", image)
     return Locator(reference, (gray.shape[-2], gray.shape[-1]), settings)(gray)
 
@@ -272,7 +268,7 @@ def _copies(reference: Reference, count: int) -> Reference:
     return reference.select(torch.zeros(count, dtype=torch.int64, device=reference.K.device))
 
 
-def as_good(score: Tensor, best: Tensor) -> Tensor:
+def as_good(score: Any, best: Any) -> Any:
     """Whether a ``score`` tells no worse match than the ``best`` one, any shape: bool."""
     factor, slack = AS_GOOD
     return 1 - score <= factor * (1 - best) + slack

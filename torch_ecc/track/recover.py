@@ -21,9 +21,10 @@ PATIENCE = 16  # frames in which a lost template is searched for at every chance
 SELDOM = 16  # frames between two searches for what has been lost for long
 
 
-def suspect(estimate: Estimate, usual: Tensor) -> Tensor:
-    """Templates that were not found, or look less like themselves than ``usual`` (R,): perhaps a wrong place, (R,)."""
-    return ~(Status.good(estimate.status) & as_good(estimate.score, usual))
+def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
+    """Templates that were not found, or look less like themselves than ``usual`` (R,): perhaps a wrong place."""
+    each = zip(estimate.status.tolist(), estimate.score.tolist(), usual.tolist(), strict=True)
+    return [status > Status.MAX_ITERATIONS or not as_good(score, most) for status, score, most in each]
 
 
 class Recovery:
@@ -43,7 +44,7 @@ class Recovery:
         ``last``: the last good pose (R, 3) and usual score (R,); ``frames`` (R,) in a row that they were suspect for.
         """
         doubted = suspect(estimate, last[1])
-        due = self.due(doubted.tolist(), frames.tolist())
+        due = self.due(doubted, frames.tolist())
         if not due:
             return estimate
         images[0] = images[0].float()

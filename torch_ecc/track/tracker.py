@@ -45,7 +45,8 @@ class Tracker(nn.Module):
     "bilinear", "bspline3", "bspline5"; ``tolerance``: px at the template's corner; ``levels``: pyramid levels;
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
-    the frame's); ``min_score``: below it a template is lost; ``search``: look for a template that is lost, or looks
+    the frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in the frame
+    it is out of view; ``search``: look for a template that is lost, or looks
     less like itself than usual, near where it is expected and then in the whole frame at any angle: in every frame at
     first, and ever more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or
     "native", see settings.Settings.
@@ -80,13 +81,14 @@ class Tracker(nn.Module):
         mask: Tensor | None = None,
         device: torch.device | str | None = None,
         min_score: float = 0.5,
+        min_visible: float = 0.25,
         search: bool = True,
         backend: str = "auto",
     ) -> None:
         super().__init__()
         if prediction not in PREDICTIONS:
             raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
-        self.settings = Settings(interpolation, max_iterations, tolerance, min_score, backend=backend)
+        self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, backend)
         self.prediction, self.search = prediction, search
         self.criterion = make_criterion(criterion, illumination)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
@@ -162,7 +164,7 @@ class Tracker(nn.Module):
 
         The frame is moved to the tracker's device. Raises ValueError for another shape, a wrong dtype, NaN.
         """
-        state = self._buffers  # a module's attributes are slow
+        state: Any = self._buffers  # a module's attributes are slow
         image = as_image("track", "frame", frame, state["pose"].device)
         if image.shape != self.frame_shape:
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
@@ -170,7 +172,7 @@ class Tracker(nn.Module):
         images = [image]
         estimate = self._solve(images, start)
         doubted = suspect(estimate, state["score"])
-        if self.search and bool(doubted.any()):
+        if any(doubted) and self.search:
             last = state["pose"], state["score"]
             estimate = self._recovery(images, estimate, start, last, state["doubted"])
             doubted = suspect(estimate, state["score"])
@@ -200,7 +202,7 @@ class Tracker(nn.Module):
         is kept only if it looks better to the next finer one than its start: fine texture is not there in a coarse
         level, which then leads anywhere."""
         images[:] = halvings(images[0].float(), self.levels) if self.levels > 1 else images
-        start, most = pose, self.settings.max_iterations
+        most = self.settings.max_iterations
         for level in range(self.levels - 1, 0, -1):
             scale, double = (pose.new_tensor((s, s, 1.0)) for s in (2.0**level, 2.0))
             state, *_ = iterate(
@@ -209,20 +211,23 @@ class Tracker(nn.Module):
             finer = self.references[level - 1], images[level - 1]
             better = likeness(*finer, state.pose * double) > likeness(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
-        del start
-        return solve(self.references[0], images[0], pose, self.settings)
+        return solve(self.references[0], images[0], pose, self.settings, self._buffers["start"])
 
-    def _advance(self, estimate: Estimate, doubted: Tensor) -> Estimate:
+    def _advance(self, estimate: Estimate, doubted: list[bool]) -> Estimate:
         """One frame on: the next state, and the ``estimate`` with the last good pose of what was not found."""
-        state, good = self._buffers, Status.good(estimate.status)
-        last, usual, tracked = state["pose"], state["score"], state["tracked"]
-        pose = torch.where(good[:, None], estimate.pose, last)
-        state["velocity"].copy_((pose - last) * (good & tracked)[:, None])
-        usual.add_((estimate.score - usual) * good, alpha=MEMORY)
-        state["tracked"].copy_(good)
-        state["doubted"].add_(1).mul_(doubted)
+        state: Any = self._buffers
+        last, usual, pose, good = state["pose"], state["score"], estimate.pose, None
+        if any(doubted):
+            good = Status.good(estimate.status)
+            pose = torch.where(good[:, None], pose, last)
+            estimate = estimate._replace(pose=pose, displacement=pose - state["start"])
+        step = (pose - last) * state["tracked"].unsqueeze(1)
+        state["velocity"].copy_(step if good is None else step * good[:, None])
+        usual.lerp_(estimate.score if good is None else torch.where(good, estimate.score, usual), MEMORY)
+        state["tracked"].copy_(torch.ones_like(state["tracked"]) if good is None else good)
+        state["doubted"].add_(1).mul_(torch.tensor(doubted, device=last.device))
         last.copy_(pose)
-        return estimate._replace(pose=pose, displacement=pose - state["start"])
+        return estimate
 
 
 def expected_score(reference: Reference) -> Tensor:

@@ -2,6 +2,7 @@
 // made anew (core/reference.py: reweigh, Moments).
 #pragma once
 #include <algorithm>
+#include <numeric>
 
 #include "template.h"
 
@@ -13,146 +14,148 @@ struct Moments {  // reference.Moments
   double gram[4][4], noise[2][4];
 };
 
+inline const std::vector<int> SHAPE{4, MOST, MOST + 1, 3};  // 1, u, v and t among `columns` of R
+
 struct Border {  // what is known of the visible pixels `of` a template
   const Pixels* of = nullptr;
-  std::vector<float> weight, before, column;  // (height, pitch)
-  std::vector<float> lines;
+  std::vector<float> weight, before, z, r;  // (height, pitch); columns of Z and R
   Moments moments;
   Weighted weighted;
 };
 
 // criteria.safe_inverse by Gauss-Jordan, with rows and columns brought to unit diagonal; zero if singular to float32.
 inline void invert(Matrix& matrix, int64_t n) {
-  double scale[MOST], wide[MOST][2 * MOST] = {};
-  for (int64_t i = 0; i < n; ++i) scale[i] = 1 / std::sqrt(std::max(std::abs(matrix[i][i]), 1e-30));
+  double scale[MOST], wide[MOST][2 * MOST] = {}, size = 0;
+  bool regular = true;
+  for (int64_t i = 0; i < n; ++i) {
+    scale[i] = 1 / std::sqrt(std::max(std::abs(matrix[i][i]), 1e-30));
+    regular = regular && matrix[i][i] > 0;
+  }
   for (int64_t i = 0; i < n; ++i) {
     for (int64_t j = 0; j < n; ++j) wide[i][j] = matrix[i][j] * scale[i] * scale[j];
     wide[i][n + i] = 1;
   }
   for (int64_t k = 0; k < n; ++k) {
-    int64_t best = k;
-    for (int64_t i = k; i < n; ++i)
-      if (std::abs(wide[i][k]) > std::abs(wide[best][k])) best = i;
-    std::swap(wide[k], wide[best]);
+    for (int64_t i = k + 1; i < n; ++i)
+      if (std::abs(wide[i][k]) > std::abs(wide[k][k])) std::swap(wide[k], wide[i]);
     const double pivot = wide[k][k];
     for (double& value : wide[k]) value /= pivot;
     for (int64_t i = 0; i < n; ++i)
       for (int64_t j = 2 * n - 1; i != k && j >= k; --j) wide[i][j] -= wide[i][k] * wide[k][j];
   }
-  double size = 0;
-  bool regular = true;
-  for (int64_t i = 0; i < n; ++i) {
-    regular = regular && matrix[i][i] > 0;
+  for (int64_t i = 0; i < n; ++i)
     for (int64_t j = 0; j < n; ++j) size += std::abs(wide[i][n + j]);
-  }
   regular = regular && size < 1e6;  // NaN and infinity compare as singular
   for (int64_t i = 0; i < MOST; ++i)
     for (int64_t j = 0; j < MOST; ++j) matrix[i][j] = regular && i < n && j < n ? wide[i][n + j] * scale[i] * scale[j] : 0;
 }
 
-// Z W v of a whole template.
-inline Coefficients project(const Template& t, const Pixels& p, const Weights& w, const float* v, Border& b) {
-  Coefficients sums{};
-  double square = 0;
-  b.lines.resize(size_t(t.lines() + 1) * p.line());
-  add_products(t, p, w, 0, p.height, v, 0, b.lines.data(), sums, square);
-  rescale(t, p, sums);
-  return sums;
+// All columns of Z (plane 0) or R (1), and then u and v: (MOST + 2, height, pitch).
+inline void columns(const Pixels& p, int plane, std::vector<float>& out) {
+  const int64_t size = p.height * p.pitch;
+  const float slope = float(p.n->unit[2 * plane]), unit = float(p.n->unit[2 * plane + 1]);
+  const float shift = float(p.shift(plane)), level = float(p.n->level[plane]);
+  out.resize((MOST + 2) * size);
+  for (int64_t j = 0; j < p.height; ++j) {
+    const int16_t* const image = p.plane(3 * plane) + j * p.pitch;
+    const float y = float(p.n->top + double(j) * p.step), v = y / float(p.n->half[1]);
+    Vector x = across(p);
+    for (int64_t i = 0; i < p.pitch; i += LANES, x += LANES * float(p.step)) {
+      const Vector gx = slope * wide(image + i), gy = slope * wide(image + size + i), t = unit * wide(image + 2 * size + i);
+      const Vector u = x / float(p.n->half[0]), lit = t + level, one = Vector{} + 1;
+      const Vector value[] = {gx,      gy,          gx * y - gy * x, t + shift,   one, lit * u,
+                              lit * v, lit * u * u, lit * (v * v),   lit * u * v, u,   one * v};
+      for (int k = 0; k < MOST + 2; ++k) store(value[k], out.data() + k * size + j * p.pitch + i);
+    }
+  }
+}
+
+// out[i][j] = sum over the pixels of w times the column a[i] of A and b[j] of B.
+template <class Out>
+void gram(const std::vector<float>& w, const std::vector<float>& A, const std::vector<int>& a, const std::vector<float>& B,
+          const std::vector<int>& b, Out& out) {
+  constexpr int64_t CHUNK = 1024;  // of which all columns stay in the nearest cache
+  const int64_t size = int64_t(w.size());
+  std::memset(&out, 0, sizeof out);
+  for (int64_t first = 0; first < size; first += CHUNK)
+    for (size_t i = 0; i < a.size(); ++i) {
+      float of_a[CHUNK];
+      const int64_t n = std::min(CHUNK, size - first);
+      for (int64_t k = 0; k < n; ++k) of_a[k] = w[first + k] * A[a[i] * size + first + k];
+      for (size_t j = 0; j < b.size(); ++j) {
+        const float* const of_b = B.data() + b[j] * size + first;
+        float sum = 0;
+        for (int64_t k = 0; k < n; ++k) sum += of_a[k] * of_b[k];
+        out[i][j] += double(sum);
+      }
+    }
+}
+
+// Narrows first <= i <= last, whole numbers, to where from + i step is between 0 and end.
+inline void clip(double from, double step, double end, double& first, double& last) {
+  const double low = -ECC_ROUNDING - from, high = end + ECC_ROUNDING - from;
+  if (step != 0) {
+    first = std::max(first, std::ceil((step > 0 ? low : high) / step));
+    last = std::min(last, std::floor((step > 0 ? high : low) / step));
+  } else if (!(low <= 0 && high >= 0)) {
+    last = -1;
+  }
 }
 
 // Weights of the pixels that the warp puts inside the frame, and what follows from them for the loop. False if none is.
 inline bool weigh(const Template& t, const Pixels& p, const Warp& warp, const Frame& frame, Border& b) {
   b.before.swap(b.weight);
-  b.weight.resize(p.height * p.pitch);
-  const double right = double(frame.w - 1) + ECC_ROUNDING, bottom = double(frame.h - 1) + ECC_ROUNDING;
+  b.weight.assign(p.height * p.pitch, 0);
   float any = 0;
   for (int64_t j = 0; j < p.height; ++j) {
-    const double py = p.n->top + double(j) * p.step, x0 = warp.x0 + warp.s * py, y0 = warp.y0 + warp.c * py;
+    const double py = p.n->top + double(j) * p.step, y0 = warp.y0 + warp.c * py, x0 = warp.x0 + warp.s * py;
+    double first = 0, last = double(p.width - 1);  // a row's visible pixels, all of which lie side by side
+    clip(x0 + warp.c * p.n->left, warp.c * p.step, double(frame.w - 1), first, last);
+    clip(y0 - warp.s * p.n->left, -warp.s * p.step, double(frame.h - 1), first, last);
     const float* const of = p.weights.at + j * p.weights.pitch;
-    float* const to = b.weight.data() + j * p.pitch;
-    for (int64_t i = 0; i < p.pitch; ++i) {
-      const double px = p.n->left + double(i) * p.step, x = x0 + warp.c * px, y = y0 - warp.s * px;
-      to[i] = x >= -ECC_ROUNDING && x <= right && y >= -ECC_ROUNDING && y <= bottom ? of[i] : 0;
-      any = std::max(any, to[i]);
-    }
+    if (!(first <= last)) continue;
+    for (int64_t i = int64_t(first); i <= int64_t(last); ++i)
+      any = std::max(any, b.weight[j * p.pitch + i] = of[i]);
   }
   if (!(any > 0)) return false;
   if (b.of == &p && b.before == b.weight) return true;
+  if (b.of != &p) {
+    columns(p, 0, b.z);
+    columns(p, 1, b.r);
+  }
   b.of = &p;
-  const Weights w{b.weight.data(), p.pitch};
-  b.column.resize(p.height * p.pitch);
-  Weighted& out = b.weighted;
-  for (int k = 0; k < t.lines(); ++k) {
-    column(p, 1, k, b.column.data());
-    const Coefficients sums = project(t, p, w, b.column.data(), b);
-    for (int j = 0; j < MOST; ++j) b.moments.normal[j][k] = sums[j];
-    for (int j = 0; j < 3 && (k == 3 || k == 4); ++j) (k == 3 ? out.of_t : out.of_one)[j] = sums[j];
-  }
-  std::copy_n(&b.moments.normal[0][0], MOST * MOST, &out.inverse[0][0]);
-  invert(out.inverse, t.columns);
-  double total = 0, along = 0, square = 0;
-  column(p, 1, 3, b.column.data());
-  for (int64_t i = 0; i < p.height * p.pitch; ++i) {
-    const double w = b.weight[i], v = b.column[i];
-    total += w;
-    along += w * v;
-    square += w * v * v;
-  }
-  out.total = total;
-  out.along = along;
-  out.contrast = std::sqrt(std::max(square - along * along / total, 0.0));
+  std::vector<int> all(t.lines());
+  std::iota(all.begin(), all.end(), 0);
+  gram(b.weight, b.z, all, b.r, all, b.moments.normal);
+  gram(b.weight, b.r, SHAPE, b.r, SHAPE, b.moments.gram);
+  const auto& m = b.moments.normal;
+  const auto& g = b.moments.gram;
+  Weighted& w = b.weighted;
+  w = {g[0][0], g[0][3], std::sqrt(std::max(g[3][3] - g[0][3] * g[0][3] / g[0][0], 0.0)), {m[0][3], m[1][3], m[2][3]},
+       {m[0][4], m[1][4], m[2][4]}};
+  std::copy_n(&m[0][0], MOST * MOST, &w.inverse[0][0]);
+  invert(w.inverse, t.columns);
   return true;
-}
-
-// Adds the row j to count, gram and noise.
-inline void add_row(const Pixels& p, int64_t j, const Border& b, Moments& m) {
-  const float *const weight = b.weight.data() + j * p.pitch, *const of_t = b.column.data() + j * p.pitch;
-  const int16_t* const wiener = p.plane(WIENER) + j * p.pitch;
-  float n = 0, w0 = 0, w1 = 0, w2 = 0, t0 = 0, t1 = 0, tt = 0, q0 = 0, q1 = 0, q2 = 0, s0 = 0, s1 = 0, s2 = 0;
-  const float left = float(p.n->left), step = float(p.step);
-  for (int64_t i = 0; i < p.pitch; ++i) {
-    const float w = weight[i], x = left + float(i) * step, t = of_t[i], q = w * (wiener[i] * (1.f / ECC_LEVELS));
-    n += w > 0 ? 1.f : 0.f;
-    w0 += w;
-    w1 += w * x;
-    w2 += w * x * x;
-    t0 += w * t;
-    t1 += w * t * x;
-    tt += w * t * t;
-    q0 += q;
-    q1 += q * x;
-    q2 += q * x * x;
-    s0 += q * q;
-    s1 += q * q * x;
-    s2 += q * q * x * x;
-  }
-  const double y = p.n->top + double(j) * p.step, v = y / p.n->half[1], u = 1 / p.n->half[0];
-  const double rows[4][4] = {{w0, w1 * u, w0 * v, t0}, {0, w2 * u * u, w1 * u * v, t1 * u}, {0, 0, w0 * v * v, t0 * v}, {0, 0, 0, tt}};
-  const double arms[2][4] = {{q0, q1, q0 * y, q2 + q0 * y * y}, {s0, s1, s0 * y, s2 + s0 * y * y}};
-  m.count += n;
-  for (int k = 0; k < 4; ++k) {
-    for (int l = k; l < 4; ++l) m.gram[k][l] += rows[k][l];
-    for (int s = 0; s < 2; ++s) m.noise[s][k] += arms[s][k];
-  }
 }
 
 // The other moments of the weights that are in force.
 inline void complete(const Template& t, const Pixels& p, Border& b) {
-  Moments& m = b.moments;
-  const Weights w{b.weight.data(), p.pitch};
-  for (int k = 0; k < t.columns; ++k) {
-    column(p, 0, k, b.column.data());
-    for (int64_t i = 0; i < p.height * p.pitch; ++i) b.column[i] *= b.weight[i];
-    const Coefficients sums = project(t, p, w, b.column.data(), b);
-    for (int j = 0; j < MOST; ++j) m.power[j][k] = sums[j];
+  std::vector<float> q(b.weight), square(b.weight);
+  const double u = p.n->half[0], v = p.n->half[1];
+  for (int power = 0; power < 2; ++power) {  // of q, then of q^2
+    for (size_t i = 0; i < q.size(); ++i) q[i] = power ? q[i] * q[i] : q[i] * (p.plane(WIENER)[i] * (1.f / ECC_LEVELS));
+    double g[3][3], *const arms = b.moments.noise[power];
+    gram(q, b.r, {4, MOST, MOST + 1}, b.r, {4, MOST, MOST + 1}, g);
+    arms[0] = g[0][0], arms[1] = g[0][1] * u, arms[2] = g[0][2] * v, arms[3] = g[1][1] * u * u + g[2][2] * v * v;
   }
-  m.count = 0;
-  std::fill_n(&m.gram[0][0], 16, 0.0);
-  std::fill_n(&m.noise[0][0], 8, 0.0);
-  column(p, 1, 3, b.column.data());
-  for (int64_t j = 0; j < p.height; ++j) add_row(p, j, b, m);
-  for (int k = 0; k < 4; ++k)
-    for (int l = 0; l < k; ++l) m.gram[k][l] = m.gram[l][k];
+  b.moments.count = 0;
+  for (float& w : square) {
+    b.moments.count += w > 0;
+    w *= w;
+  }
+  std::vector<int> all(t.columns);
+  std::iota(all.begin(), all.end(), 0);
+  gram(square, b.z, all, b.z, all, b.moments.power);
 }
 
 }  // namespace ecc

@@ -7,7 +7,7 @@
 
 #include <atomic>
 
-#include "summed.h"
+#include "solve.h"
 
 namespace {
 
@@ -89,7 +89,8 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
   const auto real = from.options();
   const Tensor pose = at::empty({count, 3}, real), error = at::empty({count}, real),
                iterations = at::empty({count}, real.dtype(at::kLong)), gain = at::empty({count}, real),
-               sums = at::empty({count, ecc::SUMS, each}, real.dtype(at::kFloat));
+               sums = at::empty({count, ecc::SUMS, each}, real.dtype(at::kFloat)),
+               total = at::empty({count, ecc::SUMS + 3}, real);
   std::vector<ecc::Moments> moments(count);
   std::vector<char> partial(count);
   std::atomic<int64_t> next{0};  // each thread takes the next one: they are not equally much work
@@ -102,8 +103,11 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
       float* const out = sums.data_ptr<float>() + b * ecc::SUMS * each;
       const bool seen = ecc::solve(t, frame_of(rows, b), settings, state, scratch);
       partial[b] = scratch.partial;
+      double* const of_all = total.data_ptr<double>() + b * (ecc::SUMS + 3);
+      std::fill_n(of_all, ecc::SUMS + 3, 0.0);
       if (seen)
-        ecc::summed(t, scratch, out);
+        ecc::summed(t, t.whole, scratch.weights(t.whole), scratch.weighted(t.whole), scratch.patch.data(), scratch.model,
+                    scratch.lines.data(), out, of_all);
       else
         std::fill_n(out, ecc::SUMS * each, 0.f);
       if (scratch.partial && seen) {
@@ -113,7 +117,7 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
       std::copy_n(state.pose, 3, pose.data_ptr<double>() + 3 * b);
       error.data_ptr<double>()[b] = state.error;
       iterations.data_ptr<int64_t>()[b] = state.iterations;
-      gain.data_ptr<double>()[b] = seen ? scratch.model.fit[3] : 0;
+      gain.data_ptr<double>()[b] = seen ? ecc::finite(scratch.model.fit[3]) : 0;
     }
   });
   const int64_t n = std::count(partial.begin(), partial.end(), 1);
@@ -124,7 +128,7 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
       index.data_ptr<int64_t>()[k] = b;
       std::copy_n(reinterpret_cast<const double*>(&moments[b]), doubles, of.data_ptr<double>() + doubles * k++);
     }
-  return {pose, error, iterations, gain, sums, index, of};
+  return {pose, error, iterations, gain, sums, total, index, of};
 }
 
 }  // namespace

@@ -1,6 +1,7 @@
 // The loop of torch_ecc/core/solver.py for one template: see there for the reasons behind each step and constant.
 #pragma once
 #include "border.h"
+#include "sums.h"
 
 namespace ecc {
 
@@ -15,12 +16,6 @@ struct State {
 struct Settings {
   int64_t degree, max_iterations;
   double tolerance;
-};
-
-struct Model {  // of a patch: its Z W (g - base), the step, and what the criterion's fit makes of it
-  float base = 0;
-  Coefficients sums{}, fit{};  // fit: of criteria.py's columns, with g's own offset in place of the one from base
-  double square = 0, step[3] = {0, 0, 0};
 };
 
 struct Scratch {  // of one thread, kept from call to call
@@ -60,7 +55,8 @@ bool find(const Template& t, const Pixels& p, const Frame& frame, const Warp& wa
   bounds(p, warp, low, high);
   scratch.partial = !(low[0] >= -ECC_ROUNDING && low[1] >= -ECC_ROUNDING && high[0] <= double(frame.w - 1) + ECC_ROUNDING &&
                       high[1] <= double(frame.h - 1) + ECC_ROUNDING);
-  if (scratch.partial && !weigh(t, p, warp, frame, scratch.border)) return false;
+  const bool somewhere = std::isfinite(warp.c + warp.s + warp.x0 + warp.y0);
+  if (scratch.partial && !(somewhere && weigh(t, p, warp, frame, scratch.border))) return false;
   Window& window = scratch.window;
   const double first = degree / 2, last = (degree + 1) / 2;
   const bool covered = low[0] - first >= double(window.x0) && low[1] - first >= double(window.y0) &&
@@ -75,9 +71,8 @@ template <int degree>
 void look(const Template& t, const Pixels& p, const Warp& warp, Scratch& scratch) {
   const Window& window = scratch.window;
   const double x0 = warp.x0 - double(window.x0 + degree / 2), y0 = warp.y0 - double(window.y0 + degree / 2);
+  scratch.model = {};
   Model& m = scratch.model;
-  m.sums = {};
-  m.square = 0;
   for (int64_t first = 0; first < p.height; first += BAND) {
     const int64_t rows = std::min(BAND, p.height - first);
     float* const band = scratch.patch.data() + first * p.pitch;
@@ -90,9 +85,17 @@ void look(const Template& t, const Pixels& p, const Warp& warp, Scratch& scratch
       fetch(p, first + BAND + j, 3);
     }
     if (first == 0) m.base = band[p.width / 2];  // sums lose little where little is left
-    add_products(t, p, scratch.weights(p), first, rows, band, m.base, scratch.lines.data(), m.sums, m.square);
+    add_up(t, p, scratch.weights(p), first, rows, band, m, scratch.lines.data());
   }
-  rescale(t, p, m.sums);
+  const double one = m.sums[4];
+  for (int k = 0; k < t.lines(); ++k) m.sums[k] = m.sums[k] * rescaled(p, k)[0] + one * rescaled(p, k)[1];
+}
+
+inline Coefficients multiply(const Template& t, const Matrix& inverse, const Coefficients& sums) {
+  Coefficients u{};
+  for (int64_t i = 0; i < t.columns; ++i)
+    for (int64_t j = 0; j < t.columns; ++j) u[i] += inverse[i][j] * sums[j];
+  return u;
 }
 
 // Criterion.step and Criterion.fit.
