@@ -150,7 +150,14 @@ def test_settings_are_written_once():
 def test_settings_reach_the_engine(tmp_path):
     """From the command line, by the job, to the record that the solver is given."""
     np.save(tmp_path / "video.npy", np.random.default_rng(0).integers(0, 255, (2, 90, 90), dtype=np.uint8))
-    other = {"interpolation": "bilinear", "max_iterations": 7, "tolerance": 0.01, "min_score": 0.7, "backend": "torch"}
+    other = {
+        "interpolation": "bilinear",
+        "max_iterations": 7,
+        "tolerance": 0.01,
+        "min_score": 0.7,
+        "min_visible": 0.4,
+        "backend": "torch",
+    }
     assert other.keys() == {each.name for each in dataclasses.fields(Settings)} & OFFERED.keys()
     options = [f"--{name.replace('_', '-')}={value}" for name, value in other.items()]
     text = written(str(tmp_path / "video.npy"), "--center", "45", "45", "--size", "31", *options)

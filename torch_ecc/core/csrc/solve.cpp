@@ -2,7 +2,7 @@
 #include <ATen/Parallel.h>
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
-#include <ATen/ops/zeros.h>
+#include <ATen/ops/nonzero.h>
 #include <torch/library.h>
 
 #include <atomic>
@@ -91,8 +91,8 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
                iterations = at::empty({count}, real.dtype(at::kLong)), gain = at::empty({count}, real),
                sums = at::empty({count, ecc::SUMS, each}, real.dtype(at::kFloat)),
                total = at::empty({count, ecc::SUMS + 3}, real);
-  std::vector<ecc::Moments> moments(count);
-  std::vector<char> partial(count);
+  const Tensor moments = at::empty({count, sizeof(ecc::Moments) / sizeof(double)}, real);
+  const Tensor partial = at::empty({count}, real.dtype(at::kBool));
   std::atomic<int64_t> next{0};  // each thread takes the next one: they are not equally much work
   at::parallel_for(0, std::min<int64_t>(count, at::get_num_threads()), 1, [&](int64_t, int64_t) {
     thread_local ecc::Scratch scratch;
@@ -102,33 +102,30 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
       ecc::State state{{at[0], at[1], at[2]}};
       float* const out = sums.data_ptr<float>() + b * ecc::SUMS * each;
       const bool seen = ecc::solve(t, frame_of(rows, b), settings, state, scratch);
-      partial[b] = scratch.partial;
       double* const of_all = total.data_ptr<double>() + b * (ecc::SUMS + 3);
-      std::fill_n(of_all, ecc::SUMS + 3, 0.0);
-      if (seen)
+      if (seen) {
         ecc::summed(t, t.whole, scratch.weights(t.whole), scratch.weighted(t.whole), scratch.patch.data(), scratch.model,
                     scratch.lines.data(), out, of_all);
-      else
+        if (scratch.partial) ecc::complete(t, t.whole, scratch.border);
+      } else {
+        scratch.border.moments = {};
         std::fill_n(out, ecc::SUMS * each, 0.f);
-      if (scratch.partial && seen) {
-        ecc::complete(t, t.whole, scratch.border);
-        moments[b] = scratch.border.moments;
+        std::fill_n(of_all, ecc::SUMS + 3, 0.0);
       }
+      if (scratch.partial)
+        std::memcpy(moments.data_ptr<double>() + b * moments.size(1), &scratch.border.moments, sizeof(ecc::Moments));
+      partial.data_ptr<bool>()[b] = scratch.partial;
       std::copy_n(state.pose, 3, pose.data_ptr<double>() + 3 * b);
       error.data_ptr<double>()[b] = state.error;
       iterations.data_ptr<int64_t>()[b] = state.iterations;
       gain.data_ptr<double>()[b] = seen ? ecc::finite(scratch.model.fit[3]) : 0;
     }
   });
-  const int64_t n = std::count(partial.begin(), partial.end(), 1);
-  constexpr int64_t doubles = sizeof(ecc::Moments) / sizeof(double);
-  const Tensor index = at::empty({n}, real.dtype(at::kLong)), of = at::empty({n, doubles}, real);
-  for (int64_t b = 0, k = 0; b < count; ++b)
-    if (partial[b]) {
-      index.data_ptr<int64_t>()[k] = b;
-      std::copy_n(reinterpret_cast<const double*>(&moments[b]), doubles, of.data_ptr<double>() + doubles * k++);
-    }
-  return {pose, error, iterations, gain, sums, total, index, of};
+  const bool* const first = partial.const_data_ptr<bool>();
+  if (std::none_of(first, first + count, [](bool each) { return each; }))
+    return {pose, error, iterations, gain, sums, total, at::empty({0}, real.dtype(at::kLong)), moments};
+  const Tensor index = at::nonzero(partial).select(1, 0);
+  return {pose, error, iterations, gain, sums, total, index, moments.index_select(0, index)};
 }
 
 }  // namespace
