@@ -175,6 +175,7 @@ class Tracker(nn.Module):
         if any(doubted) and self.search:
             last = state["pose"], state["score"]
             estimate = self._recovery(images, estimate, start, last, state["doubted"])
+            estimate = estimate._replace(displacement=estimate.pose - state["start"])
             doubted = suspect(estimate, state["score"])
         return self._advance(estimate, doubted)
 
