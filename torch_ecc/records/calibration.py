@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import plain
 from torch_ecc.core.pose import rotation
 
 
@@ -44,16 +45,19 @@ class Calibration:
         whole[2, 2] = math.copysign(1.0, math.prod(self.scales))  # a mirrored view turns the other way
         return whole
 
+    @plain
     def to_physical(self, displacement: Tensor) -> Tensor:
         """Displacements (..., 3) px, px, rad -> (..., 3) um, um, rad along the stage's axes (eq. 3)."""
         physical: Tensor = displacement @ self.matrix(displacement).mT
         return physical
 
+    @plain
     def to_pixels(self, physical: Tensor) -> Tensor:
         """The inverse of ``to_physical``: (..., 3) um, um, rad -> (..., 3) px, px, rad."""
         pixels: Tensor = physical @ torch.linalg.inv(self.matrix(physical)).mT
         return pixels
 
+    @plain
     def covariance(self, covariance: Tensor) -> Tensor:
         """Pose covariances (..., 3, 3) in px and rad -> in um and rad along the stage's axes."""
         whole = self.matrix(covariance)
@@ -70,6 +74,7 @@ class CalibrationFit(NamedTuple):
     sigma: Tensor
 
 
+@plain
 def calibrate(displacement: Tensor, commanded_um: Tensor) -> CalibrationFit:
     """Scale and axis angle from moves: measured (N, 2 or 3) px and commanded (N, 2) um -> CalibrationFit.
 
