@@ -172,6 +172,7 @@ class Tracker(nn.Module):
         twin.__dict__.update(self.__dict__, _buffers=self._buffers.copy())
         return twin
 
+    @lasting
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
@@ -185,6 +186,7 @@ class Tracker(nn.Module):
     @lasting
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self._buffers.update({name: part.clone() for name, part in self._buffers.items() if part.is_inference()})
         self._use(self._prepared(self.template, self.mask, self.centre))
 
     def get_extra_state(self) -> dict[str, Any]:
