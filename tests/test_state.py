@@ -266,7 +266,7 @@ def test_an_average_of_models_tracks_as_the_model_does(average: str, backend: st
 
 @pytest.mark.parametrize("average", AVERAGES)
 def test_an_average_of_buffers_finds_its_templates(average: str, backend: str) -> None:
-    """An average of poses is a start like any other; templates change by rounding, and the model's tracker not at all."""
+    """An average of poses is a start like any other; templates change by rounding, the model's tracker not at all."""
     model, same = Model(backend=backend), made(backend=backend)
     averaged = AveragedModel(model, use_buffers=True, **AVERAGES[average])
     for frame in FRAMES[1:5]:

@@ -6,6 +6,8 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
+from torch_ecc.core.pose import pose_dtype
+
 KEPT = (torch.uint8, torch.uint16)  # as they are, if they are grey
 EXACT = (torch.bool, torch.int8, torch.int16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 WIDE = (torch.int32, torch.int64, torch.uint32, torch.uint64)  # may hold more than a float32 does
@@ -62,13 +64,19 @@ def as_image(where: str, name: str, image: object, device: torch.device | str | 
     if channels == 1 and dtype in KEPT:
         return image if device is None or image.device == device else image.to(device=device)
     gray = image.to(device=device, dtype=torch.float32)
-    if dtype in WIDE and not bool((gray.double() == image.to(device=device).double()).all()):
+    if dtype in WIDE and not _same(gray, image):
         raise ValueError(f"{where}: {name} must hold numbers that float32 holds exactly, got {dtype} beyond 2^24")
     # The sum is finite exactly when all pixels are (no frame is large enough to overflow a float32 sum of grey
     # levels), and costs a thirtieth of isfinite().all().
     if image.is_floating_point() and not gray.sum().isfinite():
         raise ValueError(f"{where}: {name} must be finite, got {_describe_nonfinite(gray)}")
     return rgb_to_grayscale(gray[:, :3]) if gray.shape[1] > 1 else gray
+
+
+def _same(gray: Tensor, image: Tensor) -> bool:
+    """Whether float32 holds integers exactly, as far as the device has a dtype to tell it in."""
+    wide = pose_dtype(gray.device)
+    return bool((gray.to(wide) == image.to(gray.device, wide)).all())
 
 
 def _describe_nonfinite(image: Tensor) -> str:
