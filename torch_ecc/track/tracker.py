@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from copy import deepcopy
 from dataclasses import replace
 from typing import Any, Self
 
@@ -26,7 +25,6 @@ from torch_ecc.track.recover import Recovery, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
-PREPARED = ("references", "_recovery")  # what follows from a tracker's state, and may be made anew
 MEMORY = 0.05  # weight of the newest frame in the usual score
 
 
@@ -144,7 +142,7 @@ class Tracker(nn.Module):
         return references
 
     def _use(self, references: list[Reference]) -> None:
-        """Goes on with ``references``, which are never written to: copies share them."""
+        """Goes on with ``references``."""
         self.references = references
         self._recovery = Recovery(references[0], self.settings, self.turn)
 
@@ -166,39 +164,21 @@ class Tracker(nn.Module):
         self._use([reference.map(lambda tensor: tensor.to(device)) for reference in self.references])
         return self
 
-    def __copy__(self) -> Self:
-        """Another handle on the same state."""
-        twin = type(self).__new__(type(self))
-        twin.__dict__.update(self.__dict__, _buffers=self._buffers.copy())
-        return twin
-
-    @lasting
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        twin = type(self).__new__(type(self))
-        memo[id(self)] = twin
-        twin.__dict__.update(deepcopy(self.__getstate__(), memo))
-        twin._use(self.references)
-        return twin
-
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in PREPARED}
+        """Of copies and pickles: without what follows from the templates."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("references", "_recovery")}
 
     @lasting
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._buffers.update({name: part.clone() for name, part in self._buffers.items() if part.is_inference()})
+        self._buffers = {name: part.clone() if part.is_inference() else part for name, part in self._buffers.items()}
         self._use(self._prepared(self.template, self.mask, self.centre))
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a state is of, beside its tensors: a part of ``state_dict``."""
-        count, _, h, w = self.template.shape
-        return {
-            "templates": count,
-            "size": [h - 2 * MARGIN, w - 2 * MARGIN],
-            "frame": list(self.frame_shape),
-            "levels": self.levels,
-            "criterion": _named(self.criterion),
-        }
+        size = [n - 2 * MARGIN for n in self.template.shape[2:]]
+        given = {"templates": len(self.template), "size": size, "frame": list(self.frame_shape)}
+        return {**given, "levels": self.levels, "criterion": _named(self.criterion)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Refuses the state of another kind of tracker."""
@@ -208,16 +188,14 @@ class Tracker(nn.Module):
 
     @lasting
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        names = (*self._buffers, "_extra_state")
-        state = {name: state_dict[prefix + name] for name in names if prefix + name in state_dict}
-        references = self._fitting(state) if state else None
+        state = {name: state_dict.get(prefix + name) for name in (*self._buffers, "_extra_state")}
+        references = self.references if all(value is None for value in state.values()) else self._fitting(state)
         super()._load_from_state_dict(state_dict, prefix, *rest)
-        if references is not None:
-            self._use(references)
+        self._use(references)
 
     def _fitting(self, state: dict[str, Any]) -> list[Reference]:
         """The templates of a ``state``, prepared. ValueError if it is not whole or does not fit."""
-        missing = [name for name in (*self._buffers, "_extra_state") if name not in state]
+        missing = [name for name, value in state.items() if value is None]
         if missing:
             raise ValueError(f"load_state_dict: a tracker's state must be whole, got one without {', '.join(missing)}")
         self.set_extra_state(state["_extra_state"])
