@@ -251,6 +251,19 @@ class Model(nn.Module):
         return self.layer(self.trackers[0](frame).pose.float())
 
 
+def test_a_model_is_saved_with_its_trackers(backend: str) -> None:
+    """In a Sequential in a ModuleList: the state of the whole is that of its parts, refused where a part does not fit."""
+    model, other = Model(backend=backend), Model(frame=OTHER, centers=THERE, backend=backend)
+    model(FRAMES[1])
+    other.load_state_dict(through_a_file(model.state_dict()))
+    assert torch.equal(other(FRAMES[2]), model(FRAMES[2]))
+    assert_goes_on_as(other.tracker, model.tracker)
+    model, same = Model(size=(27, 27)), made(size=(27, 27))
+    with pytest.raises(ValueError, match="load_state_dict: size must be"):
+        model.load_state_dict(other.state_dict())
+    assert_goes_on_as(model.tracker, same, FRAMES[1:])
+
+
 AVERAGES = {"mean": {}, "each": {"avg_fn": get_ema_avg_fn(0.9)}, "all": {"multi_avg_fn": get_ema_multi_avg_fn(0.9)}}
 
 

@@ -218,9 +218,10 @@ def prepare(
         raise ValueError(f"prepare: template must be at least {SMALLEST}x{SMALLEST} px, got {size[0]}x{size[1]}")
     kept = gray.new_ones(1, 1, *size) if mask is None else as_mask("prepare", mask, len(gray), size).to(gray.device)
     _refuse_flat(gray, kept)
-    centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre).to(gray, copy=True)
+    centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre)
     if centre.shape != (len(gray), 2):
         raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
+    centre = centre.to(gray, copy=True)  # what is prepared keeps it
     some, used = max(PIXELS_AT_ONCE // gray[0].numel(), 1), (kept > 0).any(0).flatten()
     parts = zip(gray.split(some), kept.expand(len(gray), -1, -1, -1).split(some), centre.split(some), strict=True)
     return _joined((_prepared(chosen, *part, used) for part in parts), len(gray))
