@@ -252,7 +252,7 @@ class Model(nn.Module):
 
 
 def test_a_model_is_saved_with_its_trackers(backend: str) -> None:
-    """In a Sequential in a ModuleList: the state of the whole is that of its parts, refused where a part does not fit."""
+    """In a Sequential in a ModuleList: the state of the whole is that of its parts, refused if a part does not fit."""
     model, other = Model(backend=backend), Model(frame=OTHER, centers=THERE, backend=backend)
     model(FRAMES[1])
     other.load_state_dict(through_a_file(model.state_dict()))
