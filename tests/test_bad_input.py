@@ -9,10 +9,12 @@ import pytest
 import torch
 
 from torch_ecc import ECC, Calibration, Tracker, align, calibrate, prepare, texture
+from torch_ecc.sim.scene.scene import PlaneWaves
 
 FRAME = (100 * torch.rand(100, 120, generator=torch.Generator().manual_seed(0)) + 50).to(torch.uint8)
 GOOD = {"frame": FRAME, "centers": [(60.0, 50.0)], "size": 31}
 POSE = torch.zeros(1, 3, dtype=torch.float64)
+PATH = torch.tensor([(50, 44, 0), (51.2, 43.3, 0.02), (52.1, 42.9, 0.03)], dtype=torch.float64)
 NAN = FRAME.float().clone()
 NAN[3, 7] = math.nan
 
@@ -39,12 +41,26 @@ CALLS = {
         lambda: tracker(frame=np.zeros((9, 9))),
         r"Tracker: frame must be a torch tensor, got numpy.ndarray",
     ),
-    "frame int32": (
-        lambda: tracker(frame=FRAME.int()),
-        "Tracker: frame must be uint8, uint16 or float, got torch.int32",
+    "frame complex": (
+        lambda: tracker(frame=FRAME + 0j),
+        r"Tracker: frame must be of integers, float \(16 to 64 bits\) or bool, got torch.complex64",
     ),
-    "frame bool": (lambda: tracker(frame=FRAME > 99), "Tracker: frame must be uint8, uint16 or float, got torch.bool"),
-    "frame complex": (lambda: tracker(frame=FRAME + 0j), "uint8, uint16 or float, got torch.complex64"),
+    "frame float8": (
+        lambda: tracker(frame=FRAME.to(torch.float8_e4m3fn)),
+        r"Tracker: frame must be of integers, float \(16 to 64 bits\) or bool, got torch.float8_e4m3fn",
+    ),
+    "frame quantised": (
+        lambda: tracker(frame=torch.quantize_per_tensor(FRAME.float(), 1.0, 0, torch.quint8)),
+        r"Tracker: frame must be of integers, float \(16 to 64 bits\) or bool, got torch.quint8",
+    ),
+    "frame int32 too wide": (
+        lambda: tracker(frame=FRAME.int() + 2**24),
+        "Tracker: frame must hold numbers that float32 holds exactly, got torch.int32 beyond 2\\^24",
+    ),
+    "frame int64 too wide": (
+        lambda: tracker(frame=FRAME.expand(3, -1, -1).long() - 2**40),
+        "Tracker: frame must hold numbers that float32 holds exactly, got torch.int64 beyond 2\\^24",
+    ),
     "channels": (lambda: tracker(frame=FRAME.expand(2, -1, -1)), r"1, 3 or 4 channels, got \(2, 100, 120\)$"),
     "channels last": (
         lambda: tracker(frame=FRAME[..., None].expand(-1, -1, 3)),
@@ -124,6 +140,11 @@ CALLS = {
         "track: frame must be 1 image of 120x100 px as the first, got .* 120x99 px",
     ),
     "track shape": (lambda: tracker().track(torch.zeros(3)), r"track: frame must be \(H, W\), .*, got \(3,\)"),
+    "track complex": (lambda: tracker()(FRAME + 0j), "track: frame must be of integers, .* got torch.complex64"),
+    "track uint32 too wide": (
+        lambda: tracker()((FRAME.long() + 2**25).to(torch.uint32)),
+        "track: frame must hold numbers that float32 holds exactly, got torch.uint32",
+    ),
     "track nan": (lambda: tracker()(NAN), "track: frame must be finite, got 1 NaN"),
     "no frames": (
         lambda: tracker().track_sequence([]),
@@ -167,6 +188,65 @@ def test_says_what_was_wrong(name):
     call, message = CALLS[name]
     with pytest.raises(ValueError, match=message):
         call()
+
+
+LEVELS = 100 * PlaneWaves.random(seed=5).render(PATH, (90, 100))[:, 0] / 255  # fit int8
+TAKEN = [torch.uint16, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint32, torch.uint64]
+TAKEN += [torch.float16, torch.bfloat16, torch.float32, torch.float64]
+
+
+def poses(stack, backend):
+    """Of a tracker (2, 3), of ``align`` (1, 3), and the sigma of ``texture`` (1, 3)."""
+    center, start = [(50.0, 44.0)], torch.tensor([[40.5, 39.0, 0.01]], dtype=torch.float64)
+    track = Tracker(stack[0], center, 31, backend=backend).track_sequence(stack[1:])
+    there = align(prepare(stack[0, 20:60, 21:61]), stack[1], start, backend=backend)
+    assert not torch.cat((track.status.flatten(), there.status)).any()
+    return torch.cat((track.pose[:, 0], there.pose, texture(stack[0], center, 31)))
+
+
+@pytest.mark.parametrize("backend", ["native", "torch"])
+@pytest.mark.parametrize("dtype", TAKEN)
+def test_the_same_scene_in_each_dtype_gives_the_same_pose(dtype, backend):
+    """Integers of any width, signed or not, and float of any precision that holds the grey levels."""
+    stack = LEVELS.round()
+    expected = poses(stack.to(torch.uint8), backend=backend)
+    came = poses(stack.to(dtype), backend=backend)
+    rounding = 3 if dtype.is_floating_point else None  # the row of texture: float is not taken as rounded
+    assert (came - expected)[:rounding].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("backend", ["native", "torch"])
+def test_black_and_white_is_0_and_1(backend):
+    """A frame of bool is the frame of its numbers, and one of another dtype may follow."""
+    stack = (LEVELS - LEVELS.mean()) > 0
+    expected = poses(stack.to(torch.uint8), backend=backend)
+    assert (poses(stack, backend=backend) - expected).abs().max() < 1e-6
+    made = Tracker(stack[0], [(50.0, 44.0)], 31, criterion="ssd", backend=backend)
+    assert (made(stack[1].double()).pose - expected[0]).abs().max() < 0.05
+
+
+def test_wide_integers_need_not_be_small():
+    """Grey levels in the upper half of 32 bits, as some cameras give them, are exact in float32."""
+    stack = LEVELS.round().long()
+    assert (poses(stack << 20, "torch") - poses(stack, "torch"))[:3].abs().max() < 1e-6
+
+
+def test_colour_of_integers_is_turned_to_grey():
+    """As colour of uint8 is."""
+    stack = LEVELS.round()[:, None] * torch.tensor([0.5, 0.8, 1.0])[:, None, None]
+    came, expected = (
+        Tracker(colour[0], [(50.0, 44.0)], 31).track_sequence(colour[1:])
+        for colour in (stack.to(dtype) for dtype in (torch.int32, torch.uint8))
+    )
+    assert torch.equal(came.pose, expected.pose)
+
+
+def test_a_template_of_a_reference_is_its_own():
+    """What is prepared does not follow the tensors that it was prepared from."""
+    centre = torch.zeros(1, 2)
+    made = prepare(FRAME, centre=centre)
+    centre += 1
+    assert torch.equal(made.place.centre, torch.zeros(1, 2))
 
 
 def test_there_are_many():

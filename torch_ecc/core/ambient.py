@@ -1,8 +1,14 @@
-"""Torch's ambient state: what is computed here does not depend on where it is called from."""
+"""Torch's ambient state: what is computed here does not depend on where it is called from.
+
+A model around a tracker may run under autocast or in inference mode, a script may have set a default dtype or device.
+Autocast and inference mode are kept out at the doors, with the decorators below; defaults count nowhere, since every
+tensor is made with its own dtype and device.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
@@ -11,15 +17,30 @@ import torch
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
+AUTOCAST = ("cpu", "cuda", "mps", "xpu")  # kinds of devices that a tracker may be on and that have an autocast
+
+_anywhere: Callable[[], bool] = torch._C._is_any_autocast_enabled  # one question for all: it is asked in every frame
+
 
 def plain(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """``function`` as outside of any autocast: poses are float64 and pixels float32 whatever a model around them is."""
 
     @wraps(function)
     def protected(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        if not torch.is_autocast_enabled("cpu") and not torch.is_autocast_enabled("cuda"):
+        if not _anywhere():
             return function(*args, **kwargs)
-        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        with ExitStack() as stack:
+            for kind in AUTOCAST:
+                if torch.is_autocast_enabled(kind):
+                    stack.enter_context(torch.autocast(kind, enabled=False))
             return function(*args, **kwargs)
 
     return protected
+
+
+def lasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """``plain``, for what is kept: without gradients, and ordinary tensors in inference mode too.
+
+    A tensor made in inference mode cannot be written to outside of it, ever after.
+    """
+    return plain(torch.inference_mode(False)(torch.no_grad()(function)))

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import plain
+
 
 class Status(IntEnum):
     """Outcome per template. The first two carry a new pose; the others keep the last good one."""
@@ -74,6 +76,7 @@ class Track(Estimate):
     """The fields of Estimate stacked over F frames: (F, R, ...)."""
 
     @staticmethod
+    @plain
     def stack(estimates: Sequence[Estimate]) -> Track:
         """One record of many; ``estimates`` must not be empty."""
         return Track(*(torch.stack(values) for values in zip(*estimates, strict=True)))

@@ -6,7 +6,12 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
-PIXEL_DTYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+from torch_ecc.core.pose import pose_dtype
+
+KEPT = (torch.uint8, torch.uint16)  # as they are, if they are grey
+EXACT = (torch.bool, torch.int8, torch.int16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+WIDE = (torch.int32, torch.int64, torch.uint32, torch.uint64)  # may hold more than a float32 does
+PIXEL_DTYPES = KEPT + EXACT + WIDE
 
 
 def require_tensor(where: str, name: str, value: object) -> Tensor:
@@ -35,17 +40,19 @@ def as_gray(where: str, name: str, image: object, device: torch.device | str | N
 
 def as_image(where: str, name: str, image: object, device: torch.device | str | None = None) -> Tensor:
     """One or many images as grey levels (B, 1, H, W) on ``device``: uint8 and uint16 stay what they are if they are
-    grey already, all else becomes float32. No copy where none is needed; the numbers keep the frame's own scale.
+    grey already, all else becomes float32. No copy where none is needed; the numbers keep the frame's own scale, and
+    False and True are 0 and 1.
 
-    ``image``: (H, W), (C, H, W) or (B, C, H, W) of uint8, uint16 or float, C = 1 (grey), 3 (RGB) or 4 (RGBA; the
-    alpha is dropped). Raises ValueError for any other shape or dtype, for an empty image and for NaN or infinity.
+    ``image``: (H, W), (C, H, W) or (B, C, H, W) of integers, float or bool, C = 1 (grey), 3 (RGB) or 4 (RGBA; the
+    alpha is dropped). Raises ValueError for any other shape or dtype, for an empty image, for NaN or infinity and for
+    integers that float32 does not hold.
     """
     image = require_tensor(where, name, image)
     shape, dtype = tuple(image.shape), image.dtype
     if len(shape) not in (2, 3, 4):
         raise ValueError(f"{where}: {name} must be (H, W), (C, H, W) or (B, C, H, W), got {shape}")
     if dtype not in PIXEL_DTYPES:
-        raise ValueError(f"{where}: {name} must be uint8, uint16 or float, got {dtype}")
+        raise ValueError(f"{where}: {name} must be of integers, float (16 to 64 bits) or bool, got {dtype}")
     if 0 in shape:
         raise ValueError(f"{where}: {name} must hold pixels, got the empty shape {shape}")
     channels = shape[-3] if len(shape) > 2 else 1
@@ -54,14 +61,22 @@ def as_image(where: str, name: str, image: object, device: torch.device | str | 
         raise ValueError(f"{where}: {name} must have 1, 3 or 4 channels, got {shape}{hint}")
     while image.dim() < 4:
         image = image.unsqueeze(0)
-    if channels == 1 and not dtype.is_floating_point:
+    if channels == 1 and dtype in KEPT:
         return image if device is None or image.device == device else image.to(device=device)
     gray = image.to(device=device, dtype=torch.float32)
+    if dtype in WIDE and not _same(gray, image):
+        raise ValueError(f"{where}: {name} must hold numbers that float32 holds exactly, got {dtype} beyond 2^24")
     # The sum is finite exactly when all pixels are (no frame is large enough to overflow a float32 sum of grey
     # levels), and costs a thirtieth of isfinite().all().
     if image.is_floating_point() and not gray.sum().isfinite():
         raise ValueError(f"{where}: {name} must be finite, got {_describe_nonfinite(gray)}")
     return rgb_to_grayscale(gray[:, :3]) if gray.shape[1] > 1 else gray
+
+
+def _same(gray: Tensor, image: Tensor) -> bool:
+    """Whether float32 holds integers exactly, as far as the device has a dtype to tell it in."""
+    wide = pose_dtype(gray.device)
+    return bool((gray.to(wide) == image.to(gray.device, wide)).all())
 
 
 def _describe_nonfinite(image: Tensor) -> str:

@@ -7,6 +7,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import lasting
 from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.sampling import blur, gradients, noise_level
 
@@ -35,7 +36,7 @@ def wiener_weight(gradient: Tensor, noise: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=1)
-@torch.inference_mode(False)
+@lasting
 def noise_response() -> tuple[float, float]:
     """Of the x derivative of white noise of unit variance: raw times blurred, and blurred squared, on average."""
     impulse = torch.zeros(1, 1, 33, 33, dtype=torch.float32, device="cpu")

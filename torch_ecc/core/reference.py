@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from torch_ecc.core.ambient import plain
+from torch_ecc.core.ambient import lasting
 from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.noise import (
@@ -168,6 +168,7 @@ class Reference(_Groups):
         return self.place.unit @ self.grid.pixels
 
     @cached_property
+    @lasting
     def packed(self) -> Packed:
         """The templates in 16 bits, for a compiled engine: made once for as long as the reference lives."""
         from torch_ecc.core.packed import pack  # which needs to know what a reference is
@@ -207,8 +208,7 @@ def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared
     return make(*values)
 
 
-@plain
-@torch.no_grad()
+@lasting
 def prepare(
     template: Tensor,
     *,
@@ -230,9 +230,10 @@ def prepare(
         raise ValueError(f"prepare: template must be at least {SMALLEST}x{SMALLEST} px, got {size[0]}x{size[1]}")
     kept = gray.new_ones(1, 1, *size) if mask is None else as_mask("prepare", mask, len(gray), size).to(gray.device)
     _refuse_flat(gray, kept)
-    centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre).to(gray)
+    centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre)
     if centre.shape != (len(gray), 2):
         raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
+    centre = centre.to(gray, copy=True)  # what is prepared keeps it
     some, used = max(PIXELS_AT_ONCE // gray[0].numel(), 1), (kept > 0).any(0).flatten()
     parts = zip(gray.split(some), kept.expand(len(gray), -1, -1, -1).split(some), centre.split(some), strict=True)
     return _joined((_prepared(chosen, *part, used) for part in parts), len(gray))

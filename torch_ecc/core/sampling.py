@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
+from torch_ecc.core.ambient import lasting
 from torch_ecc.core.pose import pose_dtype
 
 MARGIN_KEPT = 3  # px: a window serves until a patch comes nearer to its border
@@ -190,7 +191,7 @@ def _mirror(index: Tensor, size: int) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # what a cache keeps must serve outside inference mode too
+@lasting
 def _to_unit(h: int, w: int, device: torch.device) -> Tensor:
     """What takes px from the first pixel to grid_sample's coordinates plus 1, which end at 2: (2, 1)."""
     ends = [[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]]
@@ -217,7 +218,7 @@ def _sum(values: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)
+@lasting
 def _band(n: int, taps: tuple[float, ...], sign: int, device: torch.device) -> Tensor:
     """Filter with ``taps`` at 0, 1, 2 ... px, odd about 0 for a ``sign`` of -1, mirrored at the border: (n, n)."""
     index = torch.arange(n, device="cpu")
@@ -238,7 +239,7 @@ def prefilter(image: Tensor, interpolation: str, ring: int = 0) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)
+@lasting
 def _prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, device: torch.device) -> Tensor:
     inverse = torch.linalg.inv(_band(n, taps, 1, torch.device("cpu")))
     extended: Tensor = inverse[_mirror(torch.arange(-ring, n + ring, device="cpu"), n)]
@@ -246,7 +247,7 @@ def _prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, device: torch.
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)
+@lasting
 def _slope_matrix(n: int, device: torch.device) -> Tensor:
     cpu = torch.device("cpu")
     slope: Tensor = _band(n, SLOPE, -1, cpu) @ torch.linalg.inv(_band(n, SAMPLERS["bspline3"].taps, 1, cpu))
@@ -269,7 +270,7 @@ def aliasing(image: Tensor, interpolation: str) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)
+@lasting
 def _alias(n: int, interpolation: str, device: torch.device) -> Tensor:
     """Samples of a signal to the error in them after it was sampled a quarter px off and interpolated back, (n, n)."""
     exact = _quarter(n, "bspline5")
@@ -304,7 +305,8 @@ def pad(image: Tensor, margin: int) -> Tensor:
 def blur(image: Tensor, sigma: float) -> Tensor:
     """Gaussian blur of (B, 1, H, W)."""
     size = 2 * int(4 * sigma + 0.5) + 1
-    return gaussian_blur2d(image, (size, size), (sigma, sigma), border_type="reflect")
+    sigmas = torch.tensor([[sigma, sigma]], dtype=image.dtype, device="cpu")  # of numbers it takes the default device
+    return gaussian_blur2d(image, (size, size), sigmas, border_type="reflect")
 
 
 def halve(image: Tensor) -> Tensor:

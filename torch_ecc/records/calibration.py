@@ -40,25 +40,27 @@ class Calibration:
         """(3, 3) of the dtype and device of ``like``: (px, px, rad) of the image to (um, um, rad) of the stage."""
         angle = torch.as_tensor(self.axis_angle, dtype=like.dtype, device=like.device)
         whole = torch.eye(3, dtype=like.dtype, device=like.device)
-        whole[:2, :2] = rotation(angle) @ torch.diag(like.new_tensor(self.scales))
+        whole[:2, :2] = rotation(angle) * like.new_tensor(self.scales)
         whole[2, 2] = math.copysign(1.0, math.prod(self.scales))  # a mirrored view turns the other way
         return whole
 
     def to_physical(self, displacement: Tensor) -> Tensor:
         """Displacements (..., 3) px, px, rad -> (..., 3) um, um, rad along the stage's axes (eq. 3)."""
-        physical: Tensor = displacement @ self.matrix(displacement).mT
-        return physical
+        return _product(displacement[..., None, :], self.matrix(displacement).mT)[..., 0, :]
 
     def to_pixels(self, physical: Tensor) -> Tensor:
         """The inverse of ``to_physical``: (..., 3) um, um, rad -> (..., 3) px, px, rad."""
-        pixels: Tensor = physical @ torch.linalg.inv(self.matrix(physical)).mT
-        return pixels
+        return _product(physical[..., None, :], torch.linalg.inv(self.matrix(physical)).mT)[..., 0, :]
 
     def covariance(self, covariance: Tensor) -> Tensor:
         """Pose covariances (..., 3, 3) in px and rad -> in um and rad along the stage's axes."""
         whole = self.matrix(covariance)
-        physical: Tensor = whole @ covariance @ whole.mT
-        return physical
+        return _product(_product(whole, covariance), whole.mT)
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """a b of (..., n, k) and (..., k, m): sums of products, which unlike a matmul no autocast rounds."""
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
 
 
 class CalibrationFit(NamedTuple):

@@ -55,7 +55,7 @@ class Bank(NamedTuple):
         reach = math.ceil(radius)
         texture, weights = _turned(template, weight, offset - corner, turns, reach)
         if disc:
-            weights = _disc_image(reach, radius).to(weights)[None]
+            weights = _disc_image(reach, radius, weights)[None]
             texture = texture * weights
         texture, planes = _orthonormal(texture, weights)
         shape = (fast_length(size[0] + 2 * reach), fast_length(size[1] + 2 * reach))
@@ -109,7 +109,7 @@ def details(reference: Reference, image: Tensor, turns: Tensor, most: int) -> Te
     reach = math.ceil(math.hypot(*template.shape[-2:]) / 2)
     (h, w), size = image.shape, [fast_length(max(n, 2 * reach + 1)) for n in image.shape]
     spectrum = torch.fft.rfft2(image - image.mean(), s=size)
-    lags = (torch.fft.fftfreq(n, 1 / n, device=image.device).abs() for n in size)
+    lags = (torch.fft.fftfreq(n, 1 / n, dtype=image.dtype, device=image.device).abs() for n in size)
     rows, columns = (F.relu(1 - lag / max(template.shape[-2:])) for lag in lags)
     window = rows[:, None] * columns  # Bartlett's: its spectrum is nowhere negative
     clutter = torch.fft.rfft2(torch.fft.irfft2(spectrum.abs().square(), s=size) * window).real
@@ -183,7 +183,7 @@ def _disc(reference: Reference) -> tuple[Tensor, float, bool]:
     _, full, corner = as_images(reference)
     h, w = full.shape[-2:]
     hole = full[0, 0] <= 0
-    y, x = torch.meshgrid(torch.arange(h, device=hole.device), torch.arange(w, device=hole.device), indexing="ij")
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=full.dtype, device=full.device) for n in (h, w)), indexing="ij")
     cx, cy = (middle - corner).tolist()
     border = min(cx, cy, w - 1 - cx, h - 1 - cy)
     holes = ((x - cx) ** 2 + (y - cy) ** 2)[hole]
@@ -225,17 +225,17 @@ def _turned(template: Tensor, weight: Tensor, middle: Tensor, turns: Tensor, rea
     return (spline(warp, pixels) * framed).view(shape), (Sampler.of(weight)(warp, pixels) * framed).view(shape)
 
 
-def _disc_image(reach: int, radius: float) -> Tensor:
-    span = torch.arange(2 * reach + 1) - reach
-    return (span[:, None] ** 2 + span**2 <= radius**2).float()
+def _disc_image(reach: int, radius: float, like: Tensor) -> Tensor:
+    span = torch.arange(2 * reach + 1, dtype=like.dtype, device=like.device) - reach
+    return (span[:, None] ** 2 + span**2 <= radius**2).to(like)
 
 
 def _orthonormal(texture: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Kernels: weighted ``texture`` (A, n, n) without its plane and of unit norm under ``weight`` (1 or A, n, n), and
     the weighted orthonormal planes (1 or A, 3, n, n)."""
     n = weight.shape[-1]
-    span = torch.linspace(-1, 1, n, device=weight.device)
-    planes = torch.stack((torch.ones(n, n, device=weight.device), span.expand(n, n), span[:, None].expand(n, n)))
+    span = torch.linspace(-1, 1, n, dtype=weight.dtype, device=weight.device)
+    planes = torch.stack((weight.new_ones(n, n), span.expand(n, n), span[:, None].expand(n, n)))
     gram = torch.einsum("aij,kij,lij->akl", weight, planes, planes)
     lower = torch.linalg.cholesky(gram.double()).float()
     basis = torch.linalg.solve_triangular(lower, planes.flatten(1).expand(len(weight), 3, -1), upper=False)

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.align import solve
+from torch_ecc.core.ambient import lasting, plain
 from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.frame import as_gray
@@ -77,6 +78,7 @@ class Located(NamedTuple):
         return self.estimate.status
 
 
+@plain
 def locate(
     reference: Reference,
     image: Tensor,
@@ -100,6 +102,7 @@ class Locator:
     ``settings``: of the last refinement.
     """
 
+    @lasting
     def __init__(self, reference: Reference, size: tuple[int, int], settings: Settings | None = None) -> None:
         self.size = size
         self.settings = settings or Settings(min_visible=LEAST_SEEN)
@@ -117,6 +120,7 @@ class Locator:
         """How many levels of a frame it needs."""
         return max(map(len, self.pyramids))
 
+    @plain
     @torch.no_grad()
     def __call__(self, image: Tensor, near: Tensor | None = None) -> Located:
         """The templates in ``image``, (1 or B, 1, H, W) or as the tracker takes it, of the locator's size; of places

@@ -109,7 +109,7 @@ class Nearby(NamedTuple):
     def _surroundings(self, image: Tensor, pose: Tensor) -> Tensor:
         """Grey levels (B, H, W) about their mean, turned as the templates are at ``pose``."""
         sides = [(n - 1) * self.step + 1 for n in self.shape]
-        y, x = torch.meshgrid(*(torch.arange(n, device=image.device) - (n - 1) / 2 for n in sides), indexing="ij")
+        y, x = torch.meshgrid(*(_span(n, image) for n in sides), indexing="ij")
         turn = rotation(pose[:, 2])
         warp = torch.cat((turn, pose[:, :2, None] + turn @ self.middle[:, :, None]), -1)
         pixels = torch.stack((x.flatten(), y.flatten(), torch.ones_like(x.flatten())))
@@ -132,7 +132,7 @@ def _peaks(score: Tensor) -> tuple[Tensor, Tensor]:
     index = ((cell + 1) * stride).sum(-1, keepdim=True)
     before, top, after = (volume.gather(1, (index + k * stride).flatten(1)).view(cell.shape) for k in (-1, 0, 1))
     offset = (after - before) / 2 / (2 * top - before - after).clamp(min=1e-6)
-    return cell - (cell.new_tensor((w, h, a)) - 1) / 2 + offset.clamp(-0.5, 0.5), height
+    return cell - score.new_tensor((w - 1, h - 1, a - 1)) / 2 + offset.clamp(-0.5, 0.5), height
 
 
 def _coarser(template: Tensor, weight: Tensor, step: int) -> tuple[Tensor, Tensor]:
@@ -147,8 +147,13 @@ def _coarser(template: Tensor, weight: Tensor, step: int) -> tuple[Tensor, Tenso
 def _rows(n: int, m: int, step: int, like: Tensor) -> Tensor:
     """What takes ``n`` samples to the ``m`` in their middle, ``step`` apart, blurred as by repeated halving: (m, n)."""
     variance = max((step**2 - 1) / 3, 1e-2)
-    place, sample = ((torch.arange(k, device=like.device) - (k - 1) / 2) for k in (m, n))
+    place, sample = (_span(k, like) for k in (m, n))
     return torch.softmax(-(sample - step * place[:, None]).square() / (2 * variance), -1)
+
+
+def _span(n: int, like: Tensor) -> Tensor:
+    """``n`` places (n,) one apart about 0."""
+    return torch.arange(n, dtype=like.dtype, device=like.device) - (n - 1) / 2
 
 
 def _tells(texture: Tensor, weights: Tensor, template: Tensor, weight: Tensor, step: int) -> bool:
@@ -168,7 +173,7 @@ def _turned(texture: Tensor, weights: Tensor, turns: Tensor) -> tuple[Tensor, Te
     """Kernels (B, A, h, w) of the weighted ``texture`` (B, 1, h, w) off the plane 1, x, y, of unit norm, turned about
     their middle; and the weights (B, 1, h, w) of unit sum, as they are without a turn."""
     b, _, h, w = texture.shape
-    y, x = torch.meshgrid(*(torch.arange(n, device=turns.device) - (n - 1) / 2 for n in (h, w)), indexing="ij")
+    y, x = torch.meshgrid(*(_span(n, turns) for n in (h, w)), indexing="ij")
     planes = torch.stack((x.flatten(), y.flatten(), torch.ones_like(x.flatten())))
     middle = turns.new_tensor(((w - 1) / 2, (h - 1) / 2))[None, :, None].expand(len(turns), 2, 1)
     warp = torch.cat((rotation(-turns), middle), -1).repeat(b, 1, 1)

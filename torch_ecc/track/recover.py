@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.reference import Reference
@@ -30,11 +31,11 @@ def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
 class Recovery:
     """The searches of one tracker, and what is prepared for them."""
 
-    def __init__(self, reference: Reference, settings: Settings) -> None:
+    def __init__(self, reference: Reference, settings: Settings, turn: Tensor) -> None:
         self.reference, self.settings = reference, settings
+        self.turn = turn  # whose turn it is if they are many, (): the tracker's, written in place
         self.locators: dict[int, Locator] = {}  # of the templates last searched for
         self.nearby: tuple[list[int], Nearby] | None = None
-        self.turn = 0  # whose turn it is if they are many
 
     def __call__(
         self, images: list[Tensor], estimate: Estimate, start: Tensor, last: tuple[Tensor, Tensor], frames: Tensor
@@ -58,18 +59,15 @@ class Recovery:
         """Which of the suspect templates to search for in this frame."""
         due = [r for r, n in enumerate(frames) if doubted[r] and n % min(2 ** (n // PATIENCE), SELDOM) == 0]
         if len(due) > AT_ONCE:
-            self.turn = (self.turn + AT_ONCE) % len(due)
-            due = due[self.turn :] + due[: self.turn]
+            turn = int(self.turn.add_(AT_ONCE).remainder_(len(due)))
+            due = due[turn:] + due[:turn]
         return due[:NEARBY_AT_ONCE]
 
     def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor, due: list[int]) -> Estimate:
         """Second attempt for the templates ``due``: around their ``start`` (R, 3)."""
         index = torch.tensor(due, device=start.device)
-        templates = self.reference.select(index)
-        if self.nearby is None or self.nearby[0] != due:
-            self.nearby = due, Nearby.of(templates)
         view = image if len(image) == 1 else image[index]
-        found = self.nearby[1].find(templates, view, start[index], self.settings)
+        found = self.surroundings(due).find(self.reference.select(index), view, start[index], self.settings)
         known = (found.status == Status.CONVERGED) & as_good(found.score, usual[index])
         return estimate.put(index[known], found.at(known))
 
@@ -89,6 +87,15 @@ class Recovery:
         index = torch.tensor([r], device=pose.device)
         return estimate.put(index, best.at(index.new_zeros(1)))
 
+    @lasting
+    def surroundings(self, due: list[int]) -> Nearby:
+        """The search near where the templates ``due`` are expected, kept while they are the same ones."""
+        if self.nearby is None or self.nearby[0] != due:
+            index = torch.tensor(due, device=self.reference.K.device)
+            self.nearby = due, Nearby.of(self.reference.select(index))
+        return self.nearby[1]
+
+    @lasting
     def locator(self, r: int, size: tuple[int, int]) -> Locator:
         """The search for template ``r``, kept for the ``AT_ONCE`` last ones."""
         if r not in self.locators:

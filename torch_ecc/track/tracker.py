@@ -10,14 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from torch_ecc.core.align import solve
-from torch_ecc.core.ambient import plain
+from torch_ecc.core.ambient import lasting, plain
 from torch_ecc.core.criteria import Criterion, make_criterion
 from torch_ecc.core.estimate import Estimate, Status, Track
-from torch_ecc.core.frame import as_device, as_gray, as_image
-from torch_ecc.core.patches import Centers, Size, crop, locate_patches
+from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
+from torch_ecc.core.patches import Centers, Crop, Size, crop, locate_patches
 from torch_ecc.core.pose import ahead
 from torch_ecc.core.pyramid import SMALLEST_COARSE, pyramid
-from torch_ecc.core.reference import Reference, prepare
+from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.search.locate import LEAST_SEEN, Located, Locator, halvings, likeness
@@ -51,10 +51,13 @@ class Tracker(nn.Module):
     first, and ever more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or
     "native", see settings.Settings.
 
-    What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other.
-    Raises ValueError for what does not fit.
+    What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
+    with its own options. A state comes whole or not at all; what does not fit is refused before anything is changed.
+    Every part of it keeps its identity: it is written in place, in each frame and when it is assigned to. Copies and
+    pickles hold the state and make the rest anew. Raises ValueError for what does not fit.
     """
 
+    _buffers: dict[str, Tensor]  # type: ignore[assignment]  # none of them is ever None
     template: Tensor
     mask: Tensor
     centre: Tensor
@@ -64,7 +67,9 @@ class Tracker(nn.Module):
     score: Tensor
     tracked: Tensor
     doubted: Tensor
+    turn: Tensor
 
+    @lasting
     def __init__(  # noqa: PLR0913 - the constructor is the list of all choices
         self,
         frame: Tensor,
@@ -96,19 +101,21 @@ class Tracker(nn.Module):
         patches = locate_patches("Tracker", gray, centers, size, mask)
         _check_levels(levels, patches.size)
         self.levels = levels
-        with torch.no_grad():
-            for name, value in crop(gray, patches)._asdict().items():
-                self.register_buffer(name, value)
-            self._prepare()
-            start = torch.nn.functional.pad(patches.centers, (0, 1))
-            self.register_buffer("start", start)  # of every template, all (R, 3), px, px, rad
-            self.register_buffer("pose", start.clone())  # the last good one
-            self.register_buffer("velocity", torch.zeros_like(start))  # what the last step has added to it
-            self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
-            self.register_buffer("tracked", torch.ones_like(start[:, 0], dtype=torch.bool))  # in the last frame
-            self.register_buffer("doubted", torch.zeros_like(start[:, 0], dtype=torch.int64))  # frames in a row
+        templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
+        none = torch.zeros_like(start[:, 0], dtype=torch.int64)
+        for name, value in templates._asdict().items():
+            self.register_buffer(name, value)
+        self.register_buffer("start", start)  # of every template, all (R, 3), px, px, rad
+        self.register_buffer("pose", start.clone())  # the last good one
+        self.register_buffer("velocity", torch.zeros_like(start))  # what the last step has added to it
+        self.register_buffer("tracked", (none + 1).to(torch.int8))  # in the last frame, 0 or 1: averages of bool fail
+        self.register_buffer("doubted", none)  # frames in a row
+        self.register_buffer("turn", none[0].clone())  # (): which of many lost ones is searched for next
+        self._use(self._prepared(*templates))
+        self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
 
     @classmethod
+    @plain
     def find(
         cls, template: Tensor, frame: Tensor, *, near: Tensor | None = None, **options: Any
     ) -> tuple[Tracker, Located]:
@@ -129,33 +136,78 @@ class Tracker(nn.Module):
         tracker.pose.copy_(located.pose)
         return tracker, located
 
-    def _prepare(self) -> None:
-        """What follows from the templates."""
-        reference = prepare(self.template, criterion=self.criterion, mask=self.mask, centre=self.centre)
-        self.references: list[Reference] = pyramid(reference, self.levels)
-        if len(self.references) < self.levels:
-            raise ValueError(f"levels: expected at most {len(self.references)} for these templates, got {self.levels}")
-        self._recovery = Recovery(reference, self.settings)
+    def _prepared(self, template: Tensor, mask: Tensor, centre: Tensor) -> list[Reference]:
+        """Every level of templates as ``crop`` gives them."""
+        references = pyramid(prepare(template, criterion=self.criterion, mask=mask, centre=centre), self.levels)
+        if len(references) < self.levels:
+            raise ValueError(f"levels: expected at most {len(references)} for these templates, got {self.levels}")
+        return references
 
+    def _use(self, references: list[Reference]) -> None:
+        """Goes on with ``references``."""
+        self.references = references
+        self._recovery = Recovery(references[0], self.settings, self.turn)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """What is assigned to a part of the state, ``tracker.pose = pose``, is written into it."""
+        part = self.__dict__.get("_buffers", {}).get(name)
+        if part is None:
+            super().__setattr__(name, value)
+        elif require_tensor("Tracker", name, value).shape != part.shape:
+            raise ValueError(f"Tracker: {name} must be {tuple(part.shape)}, got {tuple(value.shape)}")
+        else:
+            part.copy_(value.detach())
+
+    @lasting
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # Only the device may change: poses stay float64 and pixels float32 whatever the rest of a model is cast to.
         device = fn(self.score).device
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
-        self.references = [reference.map(lambda tensor: tensor.to(device)) for reference in self.references]
-        self._recovery = Recovery(self.references[0], self.settings)
+        self._use([reference.map(lambda tensor: tensor.to(device)) for reference in self.references])
         return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Of copies and pickles: without what follows from the templates."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("references", "_recovery")}
+
+    @lasting
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self._buffers = {name: part.clone() if part.is_inference() else part for name, part in self._buffers.items()}
+        self._use(self._prepared(self.template, self.mask, self.centre))
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a state is of, beside its tensors: a part of ``state_dict``."""
-        return {"criterion": str(self.criterion), "levels": self.levels, "frame": list(self.frame_shape)}
+        size = [n - 2 * MARGIN for n in self.template.shape[2:]]
+        given = {"templates": len(self.template), "size": size, "frame": list(self.frame_shape)}
+        return {**given, "levels": self.levels, "criterion": _named(self.criterion)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Refuses a state that is not of such a tracker, and prepares the templates that have come with it."""
+        """Refuses the state of another kind of tracker."""
         for name, value in self.get_extra_state().items():
             if state.get(name) != value:
                 raise ValueError(f"load_state_dict: {name} must be {value}, as this tracker's, got {state.get(name)}")
-        with torch.no_grad():
-            self._prepare()
+
+    @lasting
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        state = {name: state_dict.get(prefix + name) for name in (*self._buffers, "_extra_state")}
+        references = self.references if all(value is None for value in state.values()) else self._fitting(state)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+        self._use(references)
+
+    def _fitting(self, state: dict[str, Any]) -> list[Reference]:
+        """The templates of a ``state``, prepared. ValueError if it is not whole or does not fit."""
+        missing = [name for name, value in state.items() if value is None]
+        if missing:
+            raise ValueError(f"load_state_dict: a tracker's state must be whole, got one without {', '.join(missing)}")
+        self.set_extra_state(state["_extra_state"])
+        for name, part in self._buffers.items():
+            value = require_tensor("load_state_dict", name, state[name])
+            if value.shape != part.shape:
+                raise ValueError(f"load_state_dict: {name} must be {tuple(part.shape)}, got {tuple(value.shape)}")
+            if not bool(value.isfinite().all()):
+                raise ValueError(f"load_state_dict: {name} must be finite")
+        return self._prepared(*(state[name].to(self._buffers[name]) for name in Crop._fields))
 
     @plain
     @torch.no_grad()
@@ -235,6 +287,12 @@ def expected_score(reference: Reference) -> Tensor:
     """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
     noise, normal = reference.noise.level, reference.normal
     return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
+
+
+def _named(criterion: Criterion) -> str:
+    """What tells a criterion, in another process too: its own words if it has some, or its class."""
+    kind = type(criterion)
+    return f"{kind.__module__}.{kind.__qualname__}" if kind.__repr__ is object.__repr__ else repr(criterion)
 
 
 def _check_levels(levels: int, size: tuple[int, int]) -> None:
