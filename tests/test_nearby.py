@@ -12,7 +12,7 @@ from torch_ecc.core.criteria import make_criterion
 from torch_ecc.core.patches import cut, locate_patches
 from torch_ecc.core.pose import compose
 from torch_ecc.core.settings import Settings
-from torch_ecc.search.nearby import FARTHEST, WIDEST, Nearby
+from torch_ecc.search.nearby import HALF_WIDTH, LARGEST_ANGLE, Nearby
 from torch_ecc.sim.scene.scene import Pads, PlaneWaves
 from torch_ecc.track.tracker import AT_ONCE, NEARBY_AT_ONCE
 
@@ -79,7 +79,7 @@ def test_light_and_what_the_mask_leaves_out_do_not_mislead(mask):
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(
-    "jump", [(5.1, -3.3, 0.0), (-9.7, 9.1, 3.3), (0.0, 0.9 * FARTHEST, -0.9 * math.degrees(WIDEST))]
+    "jump", [(5.1, -3.3, 0.0), (-9.7, 9.1, 3.3), (0.0, 0.9 * HALF_WIDTH, -0.9 * math.degrees(LARGEST_ANGLE))]
 )
 def test_a_near_jump_needs_no_search_of_the_frame(name, jump, monkeypatch):
     monkeypatch.setattr(Tracker, "_search", no_search)

@@ -21,7 +21,7 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import on_host
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, stage
-from torch_ecc.search.locate import LEAST_SEEN, Located, Locator, as_good, halvings, likeness
+from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid, within_margin
 from torch_ecc.search.nearby import Nearby
 
 STATE = ("pose", "velocity", "start", "score", "tracked", "doubted")  # in the order of native.track
@@ -126,7 +126,7 @@ class Tracker(nn.Module):
         h, w = gray.shape[-2:]
         tracker = cls(gray, [((w - 1) / 2, (h - 1) / 2)] * len(gray), (h, w), **options)
         view = as_gray("find", "frame", frame, tracker.pose.device)
-        settings = replace(tracker.settings, min_visible=LEAST_SEEN)
+        settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
         tracker.frame_shape = tuple(view.shape)
         tracker.start, tracker.pose = located.pose.clone(), located.pose.clone()
@@ -213,13 +213,13 @@ class Tracker(nn.Module):
         """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are. What a level has found
         is kept only if it looks better to the next finer one than its start: fine texture is not there in a coarse
         level, which then leads anywhere."""
-        images[:] = halvings(images[0].float(), self.levels) if self.levels > 1 else images
+        images[:] = image_pyramid(images[0].float(), self.levels) if self.levels > 1 else images
         for level in range(self.levels - 1, 0, -1):
             scale, budget = pose.new_tensor((2.0**level, 2.0**level, 1.0)), self.settings.max_iterations
             state = State.start(self.references[level], pose / scale)
             state = stage(self.references[level], images[level], state, "bilinear", COARSE_TOLERANCE, budget)
             double, finer = pose.new_tensor((2.0, 2.0, 1.0)), (self.references[level - 1], images[level - 1])
-            better = likeness(*finer, state.pose * double) > likeness(*finer, pose / scale * double)
+            better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
         return solve(self.references[0], images[0], pose, self.settings)
 
@@ -239,7 +239,7 @@ class Tracker(nn.Module):
             self._nearby = due, Nearby.of(self.references[0].select(index))
         own = image if len(image) == 1 else image[index]
         found = self._nearby[1].find(self.references[0].select(index), own, start[index], self.settings)
-        known = (found.status == Status.CONVERGED) & as_good(found.score, self.score[index])
+        known = (found.status == Status.CONVERGED) & within_margin(found.score, self.score[index])
         return estimate.put(index[known], found.at(known))
 
     def _search(self, images: list[Tensor], estimate: Estimate, r: int) -> Estimate:
@@ -250,15 +250,15 @@ class Tracker(nn.Module):
                 del self._locators[next(iter(self._locators))]
             one = self.references[0].select(torch.tensor([r], device=self.pose.device))
             locator = Locator(
-                one, (images[0].shape[-2], images[0].shape[-1]), replace(self.settings, min_visible=LEAST_SEEN)
+                one, (images[0].shape[-2], images[0].shape[-1]), replace(self.settings, min_visible=LEAST_VISIBLE)
             )
             self._locators[r] = locator
-        images += halvings(images[-1], locator.levels - len(images) + 1)[1:]
+        images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         own = [image if len(image) == 1 else image[r : r + 1] for image in images]
         found, score = locator.candidates(own, 0, self.pose[r])
         if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * self.score[r]:
             return estimate
-        if Status.good(estimate.status[r]) and as_good(estimate.score[r], found.score[0]):
+        if Status.good(estimate.status[r]) and within_margin(estimate.score[r], found.score[0]):
             return estimate
         best = found._replace(pose=torch.cat((found.pose[:, :2], unwrap(found.pose[:, 2:], self.pose[r, 2])), -1))
         index = torch.tensor([r], device=self.pose.device)
@@ -281,7 +281,7 @@ class Tracker(nn.Module):
 
 def _strange(estimate: Estimate, usual: Any) -> Any:
     """Templates that were not found, or look less like themselves than usual: perhaps a wrong place, (R,) bool."""
-    return ~(Status.good(on_host(estimate.status)) & as_good(on_host(estimate.score), usual))
+    return ~(Status.good(on_host(estimate.status)) & within_margin(on_host(estimate.score), usual))
 
 
 def expected_score(reference: Reference) -> Tensor:
