@@ -195,6 +195,29 @@ def test_ambiguity_is_told(name, noise):
         assert abs(float(found.pose[0, 0] - found.runner_up.pose[0, 0])) == pytest.approx(130, abs=0.1)
 
 
+@pytest.mark.parametrize(
+    ("noise", "mark", "ambiguous"),
+    [
+        *[(0.0, 0.08, True), (0.0, 0.2, False)],  # ZNCC lacks to 1, second against first: 0.003 to 0, 0.02 to 0
+        *[(0.2, 0.1, True), (0.2, 0.35, False)],  # 0.042 to 0.038, 0.09 to 0.038
+        *[(0.3, 0.25, True), (0.3, 0.45, False)],  # 0.103 to 0.08, 0.15 to 0.08
+    ],
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_look_alike_is_told_from_the_target_by_what_noise_leaves_of_the_difference(noise, mark, ambiguous, seed):
+    """A twin with ``mark`` of the contrast in marks of its own; noise in template and frame takes from both scores."""
+    tile, other = (crop(PlaneWaves.random(seed=s))[0, 0].float() for s in (5, 12))
+    marks = mark * (other - other.mean()) * tile.std() / other.std()
+    frame = PlaneWaves.random(seed=31).render(rows((0, 0, 0)), SIZE)[0, 0].float()
+    frame[70:131, 20:81], frame[70:131, 150:211] = tile, tile + marks
+    generator = torch.Generator().manual_seed(seed)
+    template, image = (f + noise * tile.std() * torch.randn(f.shape, generator=generator) for f in (tile, frame))
+    found = locate(prepare(template), image)
+    assert bool(found.ambiguous) == ambiguous
+    assert error(found.pose, rows((50, 100, 0)))[0] < 0.05
+    assert error(found.runner_up.pose, rows((180, 100, 0)))[0] < 0.5  # its marks pull
+
+
 def test_near_tells_which_of_two_is_meant():
     locator = Locator(prepare(crop(SCENE)), SIZE)
     for x in (50.0, 180.0):
