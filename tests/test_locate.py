@@ -14,6 +14,14 @@ from torch_ecc import Locator, Status, Tracker, align, locate, prepare
 from torch_ecc.cli import app
 from torch_ecc.commands.track import Session, TrackJob
 from torch_ecc.core.pose import compose, inverse
+from torch_ecc.search.locate import (
+    FEWEST,
+    GRID_MARGIN,
+    detrended_zncc_at,
+    image_pyramid,
+    pose_distance,
+    shortlist,
+)
 from torch_ecc.sim import Camera, GradientLight, PlaneWaves, Speckle, micrograph
 
 SIZE = (200, 260)
@@ -64,12 +72,42 @@ def test_finds_any_pose_in_noise_and_uneven_light(scene):
         found = locator(frame)
         assert found.status == Status.CONVERGED
         assert not found.ambiguous
+        assert -1 < found.runner_up_score < found.score  # the next best, however bad, is told
         px, deg = error(found.pose - found.estimate.displacement, pose)
         assert px < 1
         assert deg < 1
         tracked = align(reference, frame, pose[None])
         assert error(found.pose, tracked.pose)[0] < 2e-3
         assert abs(float(found.pose[0, 2])) <= math.pi
+
+
+@pytest.mark.parametrize("scene", [SCENE, micrograph(), Speckle.random()], ids=["waves", "micrograph", "speckle"])
+def test_half_way_between_pixels_and_angles_the_target_loses_less_than_the_margin(scene):
+    """A rival on the grid that looks exactly like the template does not drive it off the list of candidates."""
+    locator = Locator(prepare(crop(scene, 81, noise=3.0)), SIZE)
+    level, bank = locator.levels - 1, locator.banks[0]
+    reference, scale = locator.pyramids[0][level], torch.tensor([2.0**level, 2.0**level, 1.0]).double()
+    for k in (2, 11, 25):
+        middle = torch.tensor([30.5 + k, 45.5, float(bank.angles[k : k + 2].mean())]).double()
+        image = image_pyramid(shot(scene, (middle * scale)[None], noise=3.0, seed=k).float(), level + 1)[level]
+        pose, score = bank.candidates(image[0, 0], 100)
+        near = pose_distance(pose, middle, radius=reference.radius) < 4
+        assert score[near].max() > detrended_zncc_at(reference, image, middle[None]) - GRID_MARGIN
+
+
+def test_the_shortlist_is_what_may_still_be_best():
+    """s >= max(LEAST_SCORE, s_best - margin) or among the FEWEST best, and of poses within SUPPRESSION px the best."""
+    n, radius = 40, torch.tensor(20.0).double()
+    score = torch.linspace(0.9, 0.5, n)
+    pose = torch.stack((10.0 * torch.arange(n), torch.zeros(n), torch.zeros(n)), -1).double()
+    assert shortlist(pose, score, radius=radius, margin=0.2).tolist() == list(range(20))
+    assert shortlist(pose, score - 0.4, radius=radius, margin=0.3).tolist() == list(range(20))  # of them none below 0.3
+    assert shortlist(pose, score - 0.8, radius=radius, margin=0.3).tolist() == list(range(FEWEST))
+    mixed = torch.randperm(n, generator=torch.Generator().manual_seed(0))
+    assert (score[mixed][shortlist(pose[mixed], score[mixed], radius=radius, margin=1.0)].diff() < 0).all()
+    twins = torch.cat((pose, pose + torch.tensor([0.5, 0.0, math.tau + 0.9 / 20]), pose + torch.tensor([0, 2.0, 0.0])))
+    kept = shortlist(twins, torch.cat((score, score - 0.01, score - 0.011)), radius=radius, margin=1.0)
+    assert sorted(kept.tolist()) == [*range(n), *range(2 * n, 3 * n)]  # 0.5 + 0.9 px are one pose, 2 px are another
 
 
 def test_a_move_of_the_frame_moves_the_answer():

@@ -1,8 +1,8 @@
 """Find templates anywhere in a frame, at any angle, without a start: global search, coarse to fine (section V).
 
-The correlation with every place and angle at a coarse level (``bank``) gives candidates; Gauss-Newton aligns
-them, level by level; non-maximum suppression over poses and score margins leave few. When the best of them are
-ambiguous, places that the whitened matched filter finds at full resolution (``matched_filter``) come in as well.
+The correlation with every place and angle at a coarse level (``bank``) gives candidates. Gauss-Newton aligns them,
+level by level; score margins and non-maximum suppression leave few of them. When the best are ambiguous, places that
+a whitened matched filter finds at full resolution (``matched_filter``) come in as well.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ from torch_ecc.search.matched_filter import whitened_matches
 
 MAX_LEVELS = 8  # of a pyramid: it ends where the template gets too small
 SMALLEST_FRAME = 12  # px: a frame is not downsampled below this side
-CANDIDATES = 192  # local maxima of the score that are aligned at most; a candidate of score s is kept if
-LEAST_SCORE = 0.3  # s >= this and
-GRID_MARGIN = 0.25  # s >= s_best - this, on the grid of pixels and angles;
-ALIGNED_MARGIN = 0.1  # s >= s_best - this, once it is aligned;
-FEWEST = 6  # or if it is among so many best
+CANDIDATES = 192  # local maxima that are aligned at most: those of score s >= max(LEAST_SCORE, s_best - margin)
+LEAST_SCORE = 0.3
+GRID_MARGIN, ALIGNED_MARGIN = 0.25, 0.1  # of scores on the grid of pixels and angles; of aligned poses
+FEWEST = 6  # the best so many go on whatever their scores
 SUPPRESSION = 1.5  # px of a level at the farthest pixel: of poses nearer to each other the best one is kept
 SURVIVORS = 16  # candidates aligned at the next level
 FINALISTS = 3  # of them, refined at full resolution
@@ -54,8 +53,8 @@ class Located(NamedTuple):
     like the template, the pose being that of what looks most like it; ``displacement`` is what the last refinement has
     added. ``score`` (B,): ZNCC in [-1, 1] off the plane of light, by which candidates are ranked (the estimate's own
     is with it). ``runner_up`` and ``runner_up_score``: the same of the best pose at another place or angle; score -1
-    where there is none. ``ambiguous`` (B,) bool: the runner-up is as good, 1 - s <= 1.5 (1 - s_best) + 0.01, or the
-    texture does not fix the pose.
+    where there is none. ``ambiguous`` (B,) bool: the runner-up is as good, 1 - s <= a (1 - s_best) + b with
+    AMBIGUITY_MARGIN (a, b), or the texture does not fix the pose.
     """
 
     estimate: Estimate

@@ -1,4 +1,4 @@
-"""Laws of the search among places that look alike: the details decide, wherever and however they are turned."""
+"""Laws of the search among places that look alike: what the frame does not repeat decides, at any place and angle."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def off(pose: torch.Tensor, truth: torch.Tensor) -> float:
     return float((pose - truth)[0, :2].norm()) + HALF * math.sqrt(2) * abs(turn)
 
 
-def test_the_details_tell_what_the_coarse_search_cannot():
+def test_the_matched_filter_tells_what_the_coarse_search_cannot():
     alone = []
     for template, frame, truth in trials()[:3]:
         locator = Locator(prepare(template), (frame.shape[-2], frame.shape[-1]))
@@ -68,15 +68,15 @@ def test_the_details_tell_what_the_coarse_search_cannot():
     assert sum(e > 5 for e in alone) >= 2  # among such lines the coarse search is lost
 
 
-def test_turns_are_looked_at_with_half_turns():
-    """Each once, in (-pi, pi], whichever of a turn and its half turn comes first."""
-    turns = with_half_turns(torch.tensor([3.0, -0.1416, 0.5, 3.001, 0.501, -2.0]), torch.tensor(40.0))
-    assert turns.abs().max() <= math.pi
-    assert torch.allclose(turns[:3], torch.tensor([3.0, 0.5, -2.0]))
-    assert torch.allclose((turns[3:] - turns[:3]).abs(), torch.tensor(math.pi))
+def test_angles_come_with_their_half_turns():
+    """Each once, in (-pi, pi], whichever of an angle and its half turn comes first."""
+    angles = with_half_turns(torch.tensor([3.0, -0.1416, 0.5, 3.001, 0.501, -2.0]), torch.tensor(40.0))
+    assert angles.abs().max() <= math.pi
+    assert torch.allclose(angles[:3], torch.tensor([3.0, 0.5, -2.0]))
+    assert torch.allclose((angles[3:] - angles[:3]).abs(), torch.tensor(math.pi))
 
 
-def test_details_are_found_at_full_resolution():
+def test_rare_texture_is_found_at_full_resolution():
     """The first place is the right one, to the nearest px, at the right one of several turns."""
     turns = torch.arange(4) * math.pi / 2
     for template, frame, truth in trials():
@@ -105,7 +105,7 @@ def test_a_mask_and_a_centre_are_honoured():
 
 
 @pytest.mark.parametrize("image", [torch.full(SIZE, 90.0), lines(0, faint=0.0), torch.rand(50, 40)])
-def test_where_there_are_none_the_answer_is_finite(image):
+def test_where_nothing_is_rare_the_answer_is_finite(image):
     """Nothing, nothing but lines, and less than the template."""
     reference = prepare(patch(noisy(lines(0), 1), 100, 100))
     assert whitened_matches(reference, image, angles=torch.tensor([0.0, 1.0]), most=4).shape == (4, 3)
