@@ -95,6 +95,26 @@ def test_half_way_between_pixels_and_angles_the_target_loses_less_than_the_margi
         assert score[near].max() > detrended_zncc_at(reference, image, middle[None]) - GRID_MARGIN
 
 
+RING = torch.hypot(*torch.meshgrid(*(torch.arange(91) - 45.0,) * 2, indexing="ij")).sub(34).abs() < 10
+FINE = Speckle.random(count=250_000, sigmas=(0.7, 1.0), seed=1)
+
+
+@pytest.mark.parametrize("mask", [None, RING], ids=["all", "ring"])
+@pytest.mark.parametrize("scene", [SCENE, micrograph(), FINE], ids=["waves", "micrograph", "fine speckle"])
+def test_the_bank_tells_the_zncc_and_half_way_between_angles_less_by_no_more_than_the_margin(scene, mask):
+    """On a pixel of the level, whatever the mask."""
+    locator = Locator(prepare(crop(scene, 91), mask=mask), SIZE)
+    level, bank = locator.levels - 1, locator.banks[0]
+    reference, scale = locator.pyramids[0][level], torch.tensor([2.0**level, 2.0**level, 1.0]).double()
+    angle = bank.angles[7:9]
+    for loss, turn in ((0.03, angle[0]), (0.03, angle[1]), (GRID_MARGIN, angle.mean())):
+        pose = torch.stack((torch.tensor(120 // 2**level), torch.tensor(100 // 2**level), turn))[None].double()
+        image = image_pyramid(shot(scene, pose * scale).float(), level + 1)[level]
+        found, score = bank.candidates(image[0, 0], 20)
+        near = pose_distance(found, pose, radius=reference.radius) < 6
+        assert float(score[near].max()) == pytest.approx(float(detrended_zncc_at(reference, image, pose)), abs=loss)
+
+
 def test_the_shortlist_is_what_may_still_be_best():
     """s >= max(LEAST_SCORE, s_best - margin) or among the FEWEST best, and of poses within SUPPRESSION px the best."""
     n, radius = 40, torch.tensor(20.0).double()

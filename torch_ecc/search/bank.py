@@ -17,7 +17,7 @@ from torch_ecc.search.correlation import Correlator, Template, about_mean, detre
 
 SMALLEST_SEARCHED = 24  # px: root of the area that a template keeps at the level at which it is searched for
 LEAST_DENSITY = 0.25  # of a level's pixels: texture per bandwidth, over that of white texture of the same contrast
-ANGLE_LOSS = 0.1  # of the correlation, half way between two angles
+ANGLE_LOSS = 0.1  # of the smoothed texture's score, half way between two angles
 COARSEST_STEP, FINEST_STEP = math.radians(6), math.radians(1.5)  # from one angle to the next
 SMALLEST_DISC, LARGEST_DISC = 5, 24  # px: angles get closer with the radius, and this many pixels tell enough
 DISC_SHARE = 0.5  # of the texture must lie in a disc for the disc alone to be searched for
@@ -41,11 +41,10 @@ class Bank(NamedTuple):
         angles = _angles(template, middle, radius=extent)
         radius, about = math.ceil(extent), middle - corner
         side = (2 * radius + 1, 2 * radius + 1)
-        texture = rotated(kept * about_mean(image, kept), angles, middle=about, size=side, degree=3)
+        texture = rotated(about_mean(image, kept), angles, middle=about, size=side, degree=3)
         if disc:
             span = torch.arange(-radius, radius + 1, device=texture.device)
             weight = (span[:, None] ** 2 + span**2 <= extent**2).to(texture)[None, None]
-            texture = texture * weight
         else:
             weight = rotated(kept, angles, middle=about, size=side)
         texture, planes = detrended(texture, weight)
@@ -116,9 +115,9 @@ def _clearance(weight: Tensor, point: Tensor) -> tuple[float, float]:
 
 
 def _angles(template: Template, middle: Tensor, *, radius: float) -> Tensor:
-    """Angles (A,) of the whole circle, so close that the correlation falls by ANGLE_LOSS at most half way between.
+    """Angles (A,) of the whole circle, so close that the score falls by ANGLE_LOSS at most half way between.
 
-    Rotated by a, the score is 1 - c a^2 with c = <w, (dt/da)^2> / (2 <w, (t - mean)^2>).
+    Rotated by a, the smoothed texture's score is 1 - c a^2 with c = <w, (dt/da)^2> / (2 <w, (t - mean)^2>).
     """
     x, y = template.place - middle[:, None]
     w = template.w * (x.square() + y.square() <= radius**2)

@@ -22,7 +22,6 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import Sampler, inside
 
 FLATTEST = 1e-4  # of the image's variance: a place that has less of its own counts as having that much
-LEAST_WEIGHT = 1e-3  # of the largest: where a kernel is divided by its weight, it is by that much at least
 
 
 class Template(NamedTuple):
@@ -97,8 +96,9 @@ class Correlator(NamedTuple):
 
 
 def about_mean(image: Tensor, weight: Tensor) -> Tensor:
-    """Images (B, 1, h, w) less their means under ``weight`` (B, 1, h, w)."""
-    return image - (weight * image).sum((2, 3), keepdim=True) / weight.sum((2, 3), keepdim=True)
+    """Images (B, 1, h, w) less their means under ``weight`` (B, 1, h, w), and zero where that is zero."""
+    mean = (weight * image).sum((2, 3), keepdim=True) / weight.sum((2, 3), keepdim=True)
+    return torch.where(weight > 0, image - mean, 0.0)
 
 
 def rotated(image: Tensor, angles: Tensor, *, middle: Tensor, size: tuple[int, int], degree: int = 1) -> Tensor:
@@ -115,15 +115,14 @@ def rotated(image: Tensor, angles: Tensor, *, middle: Tensor, size: tuple[int, i
 
 
 def detrended(texture: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted ``texture`` (..., n, m) off the planes 1, x, y and of unit norm under ``weight`` (..., n, m); and
-    the weighted planes (..., 3, n, m)."""
+    """Kernels of ``texture`` (..., n, m) under ``weight`` (..., n, m): off the planes 1, x, y, of unit norm, times the
+    weight; and the orthonormal planes times the weight (..., 3, n, m)."""
     planes = _planes(weight)
-    share = (texture.unsqueeze(-3) * planes).sum((-2, -1), keepdim=True)
-    planes = planes * weight.unsqueeze(-3)
+    weighted = planes * weight.unsqueeze(-3)
+    share = (texture.unsqueeze(-3) * weighted).sum((-2, -1), keepdim=True)
     texture = texture - (share * planes).sum(-3)
-    least = (LEAST_WEIGHT * weight.amax((-2, -1), keepdim=True)).clamp(min=1e-12)
-    norm = (texture.square() / torch.maximum(weight, least)).sum((-2, -1), keepdim=True).sqrt()
-    return texture / norm.clamp(min=1e-30), planes
+    norm = (weight * texture.square()).sum((-2, -1), keepdim=True).sqrt()
+    return weight * texture / norm.clamp(min=1e-12), weighted
 
 
 def _planes(weight: Tensor) -> Tensor:

@@ -123,7 +123,7 @@ def _correlator(texture: Tensor, weight: Tensor, shape: tuple[int, int]) -> Corr
     middle = angles.new_tensor(((w - 1) / 2, (h - 1) / 2))
     textures, weights = (rotated(image, angles, middle=middle, size=(h, w)) for image in (texture, weight))
     weights = weights / weights.sum((2, 3), keepdim=True).clamp(min=1e-12)
-    kernels, _ = detrended(textures * weights, weights)
+    kernels, _ = detrended(textures, weights)
     weight = weight / weight.sum((2, 3), keepdim=True).clamp(min=1e-12)
     return Correlator.of(kernels, weight, planes=weight[:, :, None], size=shape)
 
