@@ -17,6 +17,7 @@ from torch_ecc.core.pose import compose, inverse
 from torch_ecc.search.locate import (
     FEWEST,
     GRID_MARGIN,
+    aligned,
     detrended_zncc_at,
     image_pyramid,
     pose_distance,
@@ -198,6 +199,57 @@ def test_partly_outside():
         found = locate(reference, shot(SCENE, pose))
         assert found.status == Status.CONVERGED
         assert error(found.pose, pose)[0] < 0.05
+
+
+@pytest.mark.parametrize(("visible", "scored"), [(0.45, True), (0.35, False)])
+def test_four_tenths_of_a_template_must_be_in_the_frame(visible, scored):
+    """With less the score is -1, and no answer is given."""
+    pose = rows((81 * (visible - 0.5), 100, 0))  # beyond the left border, upright
+    reference, frame = prepare(crop(SCENE, 81)), shot(SCENE, pose)
+    score = detrended_zncc_at(reference, frame.float(), pose)
+    assert (score > 0.95) if scored else (score == -1)
+    if not scored:
+        assert not Status.good(locate(reference, frame).status)
+
+
+def waves(low: float, high: float) -> PlaneWaves:
+    """Equal amplitudes, frequencies from ``low`` to ``high`` cycles per px."""
+    u, phase = torch.rand(2, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    angle, frequency = math.tau * torch.arange(100) / 100, math.tau * (low + (high - low) * u[:, None])
+    direction = torch.stack((angle.cos(), angle.sin()), -1)
+    return PlaneWaves(frequency * direction, torch.full((100,), 3.0).double(), math.tau * phase)
+
+
+@pytest.mark.parametrize(("low", "high", "level"), [(0.2, 0.25, 0), (0.02, 0.06, 2)])
+def test_the_level_that_is_searched_is_the_coarsest_that_holds_the_texture(low, high, level):
+    """Waves of 4 to 5 px are gone one level up, but for noise; waves of 16 px and more are there two levels up."""
+    scene, pose = waves(low, high), rows((170.4, 110.7, 2.1))
+    locator = Locator(prepare(crop(scene, 121, noise=2.0)), (240, 320))
+    assert locator.levels - 1 == level
+    assert error(locator(shot(scene, pose, noise=2.0, seed=1, size=(240, 320))).pose, pose)[0] < 0.05
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 3])
+def test_a_template_that_is_flat_but_in_its_corners_is_found(quarters):
+    tile = crop(waves(0.2, 0.25), 101)[0, 0].float()
+    y, x = torch.meshgrid(*(torch.arange(101) - 50.0,) * 2, indexing="ij")
+    tile[torch.hypot(x, y) < 56] = 128.0
+    frame = waves(0.19, 0.24).render(rows((0, 0, 0)), (240, 320))[0, 0].float()
+    frame[60:161, 130:231] = torch.rot90(tile, quarters)
+    locator = Locator(prepare(tile), (240, 320))
+    found, _ = locator.candidates(image_pyramid(frame[None, None], locator.levels), 0)  # without the matched filter
+    assert error(found.pose[:1], rows((180, 110, quarters * math.pi / 2)))[0] < 0.05
+
+
+def test_aligning_makes_no_candidate_worse():
+    """From starts of which some are beyond reach: a step that led to a lower score is not taken."""
+    scene, pose = waves(0.1, 0.2), rows((130, 100, 0.5))
+    reference, image = prepare(crop(scene)), shot(scene, pose).float()
+    u = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    for start in pose + u * torch.tensor([24.0, 24.0, 0.5]):  # one by one: none is suppressed
+        moved = aligned(reference, image, start[None])
+        before, after = (detrended_zncc_at(reference, image, p) for p in (start[None], moved))
+        assert after >= before
 
 
 def grating(period: float = 9.0) -> torch.Tensor:

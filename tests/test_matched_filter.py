@@ -9,7 +9,7 @@ import torch
 
 from torch_ecc import Locator, Status, align, prepare
 from torch_ecc.core.reference import blur
-from torch_ecc.search.locate import RESTART_DISTANCE, image_pyramid, with_half_turns
+from torch_ecc.search.locate import image_pyramid, with_half_turns
 from torch_ecc.search.matched_filter import whitened_matches
 
 SIZE, HALF = (240, 320), 30
@@ -121,5 +121,5 @@ def test_a_refinement_that_slides_far_begins_anew():
     tracked = align(reference, image, truth)
     start = truth + torch.tensor([[0.0, 1.6, 0.0]])
     found, _ = locator.refined(image, 0, start)
-    assert found.displacement[0, :2].norm() <= RESTART_DISTANCE
+    assert found.displacement[0, :2].norm() <= 1.0
     assert off(found.pose, tracked.pose) < 0.01
