@@ -25,7 +25,7 @@ FLATTEST = 1e-4  # of the image's variance: a place that has less of its own cou
 
 
 class Template(NamedTuple):
-    """What the search reads of B prepared templates: the one place that knows where a Reference keeps it.
+    """What bank, filter and near search read of B prepared templates: here alone they know where a Reference keeps it.
 
     At the N pixels ``place`` (2, N): weights ``w`` (B, N), grey levels ``t`` (B, N), and ``smooth`` (B, 4, N), the
     smoothed derivatives by x, y and theta and the smoothed grey levels. Places and the poses' ``centre`` (B, 2) count
