@@ -34,7 +34,7 @@ from torch_ecc import Locator, Status, align, prepare, texture
 from torch_ecc.core.pose import compose, inverse, to_opencv
 from torch_ecc.core.reference import Reference
 from torch_ecc.io import open_frames
-from torch_ecc.search.locate import halvings
+from torch_ecc.search.locate import image_pyramid
 from torch_ecc.sim import Camera, GradientLight, Pads, PlaneWaves, Scene, Speckle, micrograph
 from torch_ecc.sim.camera.still import image_scene
 
@@ -149,12 +149,12 @@ def measure(trials: Iterator[Trial]) -> tuple[str, ...]:
         if last is None or not torch.equal(trial.template, last):
             last, reference = trial.template, prepare(trial.template)
             locator = Locator(reference, (trial.frame.shape[-2], trial.frame.shape[-1]))
-            level, turns = locator.levels - 1, locator.banks[0].turns
-            bank = TurnedBank(halvings(trial.template.float(), level + 1)[-1][0, 0], turns)
+            level, turns = locator.levels - 1, locator.banks[0].angles
+            bank = TurnedBank(image_pyramid(trial.template.float(), level + 1)[-1][0, 0], turns)
         one(tally, trial, locator, reference)
         grain = 0.3 * torch.randn(trial.frame.shape, generator=torch.Generator().manual_seed(number))
         noisy = trial.frame.float() + grain  # without it OpenCV takes flat areas for perfect matches
-        coarse = halvings(noisy, level + 1)[-1][0, 0]
+        coarse = image_pyramid(noisy, level + 1)[-1][0, 0]
         rough = tally.timed("cv2", lambda bank=bank, coarse=coarse: bank(coarse))
         px, deg = error(rough * torch.tensor([2.0**level, 2.0**level, 1.0]), trial.truth)
         tally.counts["near"] += px < 2 * 2**level and deg < 360 / len(turns)
@@ -171,7 +171,7 @@ def one(tally: Tally, trial: Trial, locator: Locator, reference: Reference) -> N
     good, doubt = hit(found.pose - found.estimate.displacement, trial.truth), bool(found.ambiguous)
     answered = bool(Status.good(found.status))
     tally.times.setdefault("ambiguous" if doubt else "clear", []).append(tally.times["locate"][-1])
-    coarse = halvings(trial.frame.float(), locator.levels)[-1][0, 0]
+    coarse = image_pyramid(trial.frame.float(), locator.levels)[-1][0, 0]
     tally.timed("bank", lambda: locator.banks[0].candidates(coarse, 1))
     tally.counts["trials"] += 1
     tally.counts["hits"] += good

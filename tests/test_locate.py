@@ -14,6 +14,15 @@ from torch_ecc import Locator, Status, Tracker, align, locate, prepare
 from torch_ecc.cli import app
 from torch_ecc.commands.track import Session, TrackJob
 from torch_ecc.core.pose import compose, inverse
+from torch_ecc.search.locate import (
+    FEWEST,
+    GRID_MARGIN,
+    aligned,
+    detrended_zncc_at,
+    image_pyramid,
+    pose_distance,
+    shortlist,
+)
 from torch_ecc.sim import Camera, GradientLight, PlaneWaves, Speckle, micrograph
 
 SIZE = (200, 260)
@@ -64,12 +73,62 @@ def test_finds_any_pose_in_noise_and_uneven_light(scene):
         found = locator(frame)
         assert found.status == Status.CONVERGED
         assert not found.ambiguous
+        assert -1 < found.runner_up_score < found.score  # the next best, however bad, is told
         px, deg = error(found.pose - found.estimate.displacement, pose)
         assert px < 1
         assert deg < 1
         tracked = align(reference, frame, pose[None])
         assert error(found.pose, tracked.pose)[0] < 2e-3
         assert abs(float(found.pose[0, 2])) <= math.pi
+
+
+@pytest.mark.parametrize("scene", [SCENE, micrograph(), Speckle.random()], ids=["waves", "micrograph", "speckle"])
+def test_half_way_between_pixels_and_angles_the_target_loses_less_than_the_margin(scene):
+    """A rival on the grid that looks exactly like the template does not drive it off the list of candidates."""
+    locator = Locator(prepare(crop(scene, 81, noise=3.0)), SIZE)
+    level, bank = locator.levels - 1, locator.banks[0]
+    reference, scale = locator.pyramids[0][level], torch.tensor([2.0**level, 2.0**level, 1.0]).double()
+    for k in (2, 11, 25):
+        middle = torch.tensor([30.5 + k, 45.5, float(bank.angles[k : k + 2].mean())]).double()
+        image = image_pyramid(shot(scene, (middle * scale)[None], noise=3.0, seed=k).float(), level + 1)[level]
+        pose, score = bank.candidates(image[0, 0], 100)
+        near = pose_distance(pose, middle, radius=reference.radius) < 4
+        assert score[near].max() > detrended_zncc_at(reference, image, middle[None]) - GRID_MARGIN
+
+
+RING = torch.hypot(*torch.meshgrid(*(torch.arange(91) - 45.0,) * 2, indexing="ij")).sub(34).abs() < 10
+FINE = Speckle.random(count=250_000, sigmas=(0.7, 1.0), seed=1)
+
+
+@pytest.mark.parametrize("mask", [None, RING], ids=["all", "ring"])
+@pytest.mark.parametrize("scene", [SCENE, micrograph(), FINE], ids=["waves", "micrograph", "fine speckle"])
+def test_the_bank_tells_the_zncc_and_half_way_between_angles_less_by_no_more_than_the_margin(scene, mask):
+    """On a pixel of the level, whatever the mask."""
+    locator = Locator(prepare(crop(scene, 91), mask=mask), SIZE)
+    level, bank = locator.levels - 1, locator.banks[0]
+    reference, scale = locator.pyramids[0][level], torch.tensor([2.0**level, 2.0**level, 1.0]).double()
+    angle = bank.angles[7:9]
+    for loss, turn in ((0.03, angle[0]), (0.03, angle[1]), (GRID_MARGIN, angle.mean())):
+        pose = torch.stack((torch.tensor(120 // 2**level), torch.tensor(100 // 2**level), turn))[None].double()
+        image = image_pyramid(shot(scene, pose * scale).float(), level + 1)[level]
+        found, score = bank.candidates(image[0, 0], 20)
+        near = pose_distance(found, pose, radius=reference.radius) < 6
+        assert float(score[near].max()) == pytest.approx(float(detrended_zncc_at(reference, image, pose)), abs=loss)
+
+
+def test_the_shortlist_is_what_may_still_be_best():
+    """s >= max(LEAST_SCORE, s_best - margin) or among the FEWEST best, and of poses within SUPPRESSION px the best."""
+    n, radius = 40, torch.tensor(20.0).double()
+    score = torch.linspace(0.9, 0.5, n)
+    pose = torch.stack((10.0 * torch.arange(n), torch.zeros(n), torch.zeros(n)), -1).double()
+    assert shortlist(pose, score, radius=radius, margin=0.2).tolist() == list(range(20))
+    assert shortlist(pose, score - 0.4, radius=radius, margin=0.3).tolist() == list(range(20))  # of them none below 0.3
+    assert shortlist(pose, score - 0.8, radius=radius, margin=0.3).tolist() == list(range(FEWEST))
+    mixed = torch.randperm(n, generator=torch.Generator().manual_seed(0))
+    assert (score[mixed][shortlist(pose[mixed], score[mixed], radius=radius, margin=1.0)].diff() < 0).all()
+    twins = torch.cat((pose, pose + torch.tensor([0.5, 0.0, math.tau + 0.9 / 20]), pose + torch.tensor([0, 2.0, 0.0])))
+    kept = shortlist(twins, torch.cat((score, score - 0.01, score - 0.011)), radius=radius, margin=1.0)
+    assert sorted(kept.tolist()) == [*range(n), *range(2 * n, 3 * n)]  # 0.5 + 0.9 px are one pose, 2 px are another
 
 
 def test_a_move_of_the_frame_moves_the_answer():
@@ -142,6 +201,57 @@ def test_partly_outside():
         assert error(found.pose, pose)[0] < 0.05
 
 
+@pytest.mark.parametrize(("visible", "scored"), [(0.45, True), (0.35, False)])
+def test_four_tenths_of_a_template_must_be_in_the_frame(visible, scored):
+    """With less the score is -1, and no answer is given."""
+    pose = rows((81 * (visible - 0.5), 100, 0))  # beyond the left border, upright
+    reference, frame = prepare(crop(SCENE, 81)), shot(SCENE, pose)
+    score = detrended_zncc_at(reference, frame.float(), pose)
+    assert (score > 0.95) if scored else (score == -1)
+    if not scored:
+        assert not Status.good(locate(reference, frame).status)
+
+
+def waves(low: float, high: float) -> PlaneWaves:
+    """Equal amplitudes, frequencies from ``low`` to ``high`` cycles per px."""
+    u, phase = torch.rand(2, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    angle, frequency = math.tau * torch.arange(100) / 100, math.tau * (low + (high - low) * u[:, None])
+    direction = torch.stack((angle.cos(), angle.sin()), -1)
+    return PlaneWaves(frequency * direction, torch.full((100,), 3.0).double(), math.tau * phase)
+
+
+@pytest.mark.parametrize(("low", "high", "level"), [(0.2, 0.25, 0), (0.02, 0.06, 2)])
+def test_the_level_that_is_searched_is_the_coarsest_that_holds_the_texture(low, high, level):
+    """Waves of 4 to 5 px are gone one level up, but for noise; waves of 16 px and more are there two levels up."""
+    scene, pose = waves(low, high), rows((170.4, 110.7, 2.1))
+    locator = Locator(prepare(crop(scene, 121, noise=2.0)), (240, 320))
+    assert locator.levels - 1 == level
+    assert error(locator(shot(scene, pose, noise=2.0, seed=1, size=(240, 320))).pose, pose)[0] < 0.05
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 3])
+def test_a_template_that_is_flat_but_in_its_corners_is_found(quarters):
+    tile = crop(waves(0.2, 0.25), 101)[0, 0].float()
+    y, x = torch.meshgrid(*(torch.arange(101) - 50.0,) * 2, indexing="ij")
+    tile[torch.hypot(x, y) < 56] = 128.0
+    frame = waves(0.19, 0.24).render(rows((0, 0, 0)), (240, 320))[0, 0].float()
+    frame[60:161, 130:231] = torch.rot90(tile, quarters)
+    locator = Locator(prepare(tile), (240, 320))
+    found, _ = locator.candidates(image_pyramid(frame[None, None], locator.levels), 0)  # without the matched filter
+    assert error(found.pose[:1], rows((180, 110, quarters * math.pi / 2)))[0] < 0.05
+
+
+def test_aligning_makes_no_candidate_worse():
+    """From starts of which some are beyond reach: a step that led to a lower score is not taken."""
+    scene, pose = waves(0.1, 0.2), rows((130, 100, 0.5))
+    reference, image = prepare(crop(scene)), shot(scene, pose).float()
+    u = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    for start in pose + u * torch.tensor([24.0, 24.0, 0.5]):  # one by one: none is suppressed
+        moved = aligned(reference, image, start[None])
+        before, after = (detrended_zncc_at(reference, image, p) for p in (start[None], moved))
+        assert after >= before
+
+
 def grating(period: float = 9.0) -> torch.Tensor:
     x = torch.arange(SIZE[1], dtype=torch.float64).expand(SIZE)
     return 128 + 60 * (math.tau * x / period).sin()
@@ -193,6 +303,29 @@ def test_ambiguity_is_told(name, noise):
         assert (found.pose - found.runner_up.pose)[0, :2].norm() < 1
     if name == "twins":
         assert abs(float(found.pose[0, 0] - found.runner_up.pose[0, 0])) == pytest.approx(130, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("noise", "mark", "ambiguous"),
+    [
+        *[(0.0, 0.08, True), (0.0, 0.2, False)],  # ZNCC lacks to 1, second against first: 0.003 to 0, 0.02 to 0
+        *[(0.2, 0.1, True), (0.2, 0.35, False)],  # 0.042 to 0.038, 0.09 to 0.038
+        *[(0.3, 0.25, True), (0.3, 0.45, False)],  # 0.103 to 0.08, 0.15 to 0.08
+    ],
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_look_alike_is_told_from_the_target_by_what_noise_leaves_of_the_difference(noise, mark, ambiguous, seed):
+    """A twin with ``mark`` of the contrast in marks of its own; noise in template and frame takes from both scores."""
+    tile, other = (crop(PlaneWaves.random(seed=s))[0, 0].float() for s in (5, 12))
+    marks = mark * (other - other.mean()) * tile.std() / other.std()
+    frame = PlaneWaves.random(seed=31).render(rows((0, 0, 0)), SIZE)[0, 0].float()
+    frame[70:131, 20:81], frame[70:131, 150:211] = tile, tile + marks
+    generator = torch.Generator().manual_seed(seed)
+    template, image = (f + noise * tile.std() * torch.randn(f.shape, generator=generator) for f in (tile, frame))
+    found = locate(prepare(template), image)
+    assert bool(found.ambiguous) == ambiguous
+    assert error(found.pose, rows((50, 100, 0)))[0] < 0.05
+    assert error(found.runner_up.pose, rows((180, 100, 0)))[0] < 0.5  # its marks pull
 
 
 def test_near_tells_which_of_two_is_meant():

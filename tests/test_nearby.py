@@ -12,7 +12,7 @@ from torch_ecc.core.criteria import make_criterion
 from torch_ecc.core.patches import cut, locate_patches
 from torch_ecc.core.pose import compose
 from torch_ecc.core.settings import Settings
-from torch_ecc.search.nearby import FARTHEST, WIDEST, Nearby
+from torch_ecc.search.nearby import HALF_WIDTH, LARGEST_ANGLE, Nearby
 from torch_ecc.sim.scene.scene import Pads, PlaneWaves
 from torch_ecc.track.recover import AT_ONCE, NEARBY_AT_ONCE
 
@@ -59,7 +59,7 @@ def test_the_first_place_is_the_right_one(name, size, turn):
     off = (place[0, 0] - compose(moved, offset)).abs()
     assert off[:2].max() < 0.75, place
     assert off[2] < math.radians(0.75)
-    assert (score[0].diff() <= 0).all()
+    assert score[0].argmax() == 0
 
 
 SPAN = torch.arange(81) - 40
@@ -79,7 +79,7 @@ def test_light_and_what_the_mask_leaves_out_do_not_mislead(mask):
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(
-    "jump", [(5.1, -3.3, 0.0), (-9.7, 9.1, 3.3), (0.0, 0.9 * FARTHEST, -0.9 * math.degrees(WIDEST))]
+    "jump", [(5.1, -3.3, 0.0), (-9.7, 9.1, 3.3), (0.0, 0.9 * HALF_WIDTH, -0.9 * math.degrees(LARGEST_ANGLE))]
 )
 def test_a_near_jump_needs_no_search_of_the_frame(name, jump, monkeypatch):
     monkeypatch.setattr(Tracker, "_search", no_search)
@@ -102,15 +102,21 @@ def test_fine_texture_that_moves_farther_than_the_basin_is_never_lost(low, monke
     assert (track.displacement[:, 0] - torch.tensor(walk)).abs().max() < 0.01
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.2, 0.35])
 @pytest.mark.parametrize(("shift", "mark", "found"), [(11, 0.3, 11), (7, 0.3, 7), (11, 0.0, -7), (7, 0.0, 7)])
-def test_of_places_alike_the_better_is_taken_and_of_equal_ones_the_nearer(shift, mark, found):
-    """Cells of 18 px, told from one another by marks of 0.3 of their contrast, or by nothing."""
+def test_of_places_alike_the_better_is_taken_and_of_equal_ones_the_nearer(shift, mark, found, noise):
+    """Cells of 18 px, told from one another by marks of 0.3 of their contrast, or by nothing; noise, as a share of the
+    contrast in template and frame, takes from the scores of both."""
     cell = fine().render(MIDDLE[None], FRAME)[0, 0, :, :18].repeat(1, 18)[:, : FRAME[1]]
     marks = mark * (fine(0.15).render(MIDDLE[None], FRAME)[0, 0] - 128)
-    first = (cell + marks)[None, None]
+    generator = torch.Generator().manual_seed(0)
+    first, second = (
+        (image + noise * cell.std() * torch.randn(FRAME, generator=generator))[None, None]
+        for image in (cell + marks, (cell + marks).roll(shift, -1))
+    )
     reference = cut(first, locate_patches("", first, MIDDLE[None, :2], 61, None), LIGHT)
-    estimate = Nearby.of(reference).find(reference, first.roll(shift, -1), MIDDLE[None], Settings())
-    assert (estimate.pose - MIDDLE - torch.tensor([found, 0.0, 0.0])).abs().max() < 0.02
+    estimate = Nearby.of(reference).find(reference, second, MIDDLE[None], Settings())
+    assert (estimate.pose - MIDDLE - torch.tensor([found, 0.0, 0.0])).abs().max() < 0.02 + 0.1 * noise
 
 
 def grid(count: int) -> torch.Tensor:

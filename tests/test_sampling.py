@@ -119,7 +119,7 @@ def test_padding_keeps_the_slope_at_the_border():
 @pytest.mark.parametrize("size", [(40, 50), (41, 51)])
 def test_halving_keeps_every_second_pixel_in_place(size):
     y, x = torch.meshgrid(torch.arange(float(size[0])), torch.arange(float(size[1])), indexing="ij")
-    half = S.halve((x + 10 * y)[None, None])
+    half = S.downsample((x + 10 * y)[None, None])
     rows, columns = half.shape[-2:]
     yy, xx = torch.meshgrid(2 * torch.arange(float(rows)), 2 * torch.arange(float(columns)), indexing="ij")
     assert torch.allclose(half[0, 0, 3:-3, 3:-3], (xx + 10 * yy)[3:-3, 3:-3], atol=1e-3)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.reference import Reference, prepare
-from torch_ecc.core.sampling import halve
+from torch_ecc.core.sampling import downsample
 
 SMALLEST_COARSE = 12  # px: a template is not halved below this side
 LEAST_KEPT = 0.5  # of a coarse pixel must lie under the mask
@@ -47,7 +47,7 @@ def _halved(template: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Weights and grey levels of the next level; what the mask leaves out bears on neither."""
     seen = (weight > 0).to(weight.dtype)
     mean = (template * seen).sum((2, 3), keepdim=True) / seen.sum((2, 3), keepdim=True)
-    share = halve(seen)
-    smooth = mean + halve((template - mean) * seen) / share.clamp(min=1e-3)
-    kept = halve(weight) / share.clamp(min=1e-3) * (share >= LEAST_KEPT)
+    share = downsample(seen)
+    smooth = mean + downsample((template - mean) * seen) / share.clamp(min=1e-3)
+    kept = downsample(weight) / share.clamp(min=1e-3) * (share >= LEAST_KEPT)
     return kept, smooth

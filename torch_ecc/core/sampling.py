@@ -309,7 +309,7 @@ def blur(image: Tensor, sigma: float) -> Tensor:
     return gaussian_blur2d(image, (size, size), sigmas, border_type="reflect")
 
 
-def halve(image: Tensor) -> Tensor:
+def downsample(image: Tensor) -> Tensor:
     """Next pyramid level of (B, 1, H, W): blurred, and pixel (i, j) of it lies exactly at (2 i, 2 j) of ``image``."""
     return blur(image, 1.0)[:, :, ::2, ::2]
 

@@ -1,8 +1,8 @@
 """Find templates anywhere in a frame, at any angle, without a start: global search, coarse to fine (section V).
 
-The correlation with every place and turn at a coarse level (``bank``) gives candidates; Gauss-Newton brings each to its
-local best, level by level, and drops those that lead to the same pose or fall behind. When several places look alike,
-the template's ``details`` are searched for at full resolution as well.
+The correlation with every place and angle at a coarse level (``bank``) gives candidates. Gauss-Newton aligns them,
+level by level; score margins and non-maximum suppression leave few of them. When the best are ambiguous, places that
+a whitened matched filter finds at full resolution (``matched_filter``) come in as well.
 """
 
 from __future__ import annotations
@@ -22,32 +22,29 @@ from torch_ecc.core.frame import as_gray
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.pyramid import pyramid
 from torch_ecc.core.reference import Reference
-from torch_ecc.core.sampling import Sampler, halve, inside
+from torch_ecc.core.sampling import Sampler, downsample, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, iterate
-from torch_ecc.search.bank import Bank, details, search_level
+from torch_ecc.search.bank import Bank, search_level
+from torch_ecc.search.matched_filter import whitened_matches
 
-LEVELS = 8  # of a pyramid at most: it ends where the template gets too small
-SMALLEST_FRAME = 12  # px: a frame is not halved below this side
-CANDIDATES = 192  # local maxima of the correlation that are looked at, if so many are nearly as high as the best one
-HANDICAP = (
-    0.25,
-    0.1,
-)  # of correlation: what the best place may lack on the grid of pixels and turns; once it is aligned
-HOPELESS = 0.3  # correlation of what needs no closer look
-FEWEST = 6  # candidates that are looked at, however low
-SURVIVORS = 16  # of them, brought to the next level
-FINALISTS = 3  # of them, brought to the answer
-TURNS = 4  # and their half turns, at which details are looked for
-DETAILED = 4  # places with the right details, brought to the answer
-LONGEST_WAY = 1.0  # px at the farthest pixel: a refinement that took a pose farther begins anew from there
-REPEATS = 3  # of it at most
+MAX_LEVELS = 8  # of a pyramid: it ends where the template gets too small
+SMALLEST_FRAME = 12  # px: a frame is not downsampled below this side
+CANDIDATES = 192  # local maxima that are aligned at most: those of score s >= max(LEAST_SCORE, s_best - margin)
+LEAST_SCORE = 0.3
+GRID_MARGIN, ALIGNED_MARGIN = 0.25, 0.1  # of scores on the grid of pixels and angles; of aligned poses
+FEWEST = 6  # the best so many go on whatever their scores
+SUPPRESSION = 1.5  # px of a level at the farthest pixel: of poses nearer to each other the best one is kept
+SURVIVORS = 16  # candidates aligned at the next level
+FINALISTS = 3  # of them, refined at full resolution
+FILTER_ANGLES = 4  # and their half turns, at which the whitened matched filter looks
+FILTER_MATCHES = 4  # of its places, refined at full resolution
+RESTART_DISTANCE = 1.0  # px at the farthest pixel: a refinement that took a pose farther begins anew from there
+MAX_RESTARTS = 3
 COARSE_ITERATIONS = 6
 COARSE_TOLERANCE = 0.1  # px of a coarse level
-NEIGHBOURS = 1.5  # px of the search's level at the farthest pixel: maxima nearer than that lead to one pose
-DISTINCT = 1.5  # px at the farthest pixel: nearer than that two poses are one
-LEAST_SEEN = 0.4  # of a template's weight must lie in the frame
-AS_GOOD = (1.5, 0.01)  # a runner-up is as good if what its score lacks to 1 is at most a times the best one's, plus b
+LEAST_VISIBLE = 0.4  # of a template's weight must lie in the frame
+AMBIGUITY_MARGIN = (1.5, 0.01)  # (a, b): a score s is as good as the best if 1 - s <= a (1 - s_best) + b
 
 
 class Located(NamedTuple):
@@ -55,10 +52,10 @@ class Located(NamedTuple):
 
     ``estimate`` (B, ...): the best pose, theta in (-pi, pi], and its status; LOST where nothing in the frame looks
     like the template, the pose being that of what looks most like it; ``displacement`` is what the last refinement has
-    added. ``score`` (B,): correlation in [-1, 1] without the plane of light, by which candidates are ranked (the
-    estimate's own is with it). ``runner_up`` and ``runner_up_score``: the same of the best pose at another place or
-    angle; score -1 where there is none. ``ambiguous`` (B,) bool: the runner-up is as good, or the texture does not
-    fix the pose.
+    added. ``score`` (B,): ZNCC in [-1, 1] off the plane of light, by which candidates are ranked (the estimate's own
+    is with it). ``runner_up`` and ``runner_up_score``: the same of the best pose at another place or angle; score -1
+    where there is none. ``ambiguous`` (B,) bool: the runner-up is as good, 1 - s <= a (1 - s_best) + b with
+    AMBIGUITY_MARGIN (a, b), or the texture does not fix the pose.
     """
 
     estimate: Estimate
@@ -91,7 +88,7 @@ def locate(
     """
     if not isinstance(reference, Reference):
         raise ValueError(f"locate: reference must come from prepare, got {type(reference).__name__}")
-    settings = Settings.of("locate", {"min_visible": LEAST_SEEN, **options})
+    settings = Settings.of("locate", {"min_visible": LEAST_VISIBLE, **options})
     gray = as_gray("locate", "image", image)
     return Locator(reference, (gray.shape[-2], gray.shape[-1]), settings)(gray)
 
@@ -105,11 +102,10 @@ class Locator:
     @lasting
     def __init__(self, reference: Reference, size: tuple[int, int], settings: Settings | None = None) -> None:
         self.size = size
-        self.settings = settings or Settings(min_visible=LEAST_SEEN)
+        self.settings = settings or Settings(min_visible=LEAST_VISIBLE)
         self.pyramids, self.banks = [], []
-        device = reference.K.device
-        for b in range(len(reference.K)):
-            references = pyramid(reference.select(torch.tensor([b], device=device)), LEVELS)
+        for b in range(len(reference.place.radius)):
+            references = pyramid(reference.select(torch.tensor([b], device=reference.place.radius.device)), MAX_LEVELS)
             level = min(search_level(references), max((min(size) // SMALLEST_FRAME).bit_length() - 1, 0))
             h, w = (-(-n // 2**level) for n in size)
             self.pyramids.append(references[: level + 1])
@@ -124,9 +120,9 @@ class Locator:
     @torch.no_grad()
     def __call__(self, image: Tensor, near: Tensor | None = None) -> Located:
         """The templates in ``image``, (1 or B, 1, H, W) or as the tracker takes it, of the locator's size; of places
-        that look alike the one nearest to ``near`` (B, 2 or 3), px (and rad), if that is given."""
+        that are as good the one nearest to ``near`` (B, 2 or 3), px (and rad), if that is given."""
         gray = as_gray("locate", "image", image)
-        count, device = len(self.banks), self.banks[0].turns.device
+        count, device = len(self.banks), self.banks[0].angles.device
         if gray.shape[-2:] != self.size or len(gray) not in (1, count):
             (h, w), n = self.size, f"1 or {count}" if count > 1 else "1"
             raise ValueError(f"locate: image must be {n} of {w}x{h} px, got {tuple(gray.shape)}")
@@ -134,86 +130,89 @@ class Locator:
             raise ValueError(f"locate: image must be on the reference's device {device}, got {gray.device}")
         if near is not None and (near.dim() != 2 or len(near) != count or near.shape[1] not in (2, 3)):
             raise ValueError(f"locate: near must be ({count}, 2) or ({count}, 3), got {tuple(near.shape)}")
-        images = halvings(gray, self.levels)
+        images = image_pyramid(gray, self.levels)
         places = [None] * count if near is None else list(near.to(self.pyramids[0][0].place.radius))
-        return _decide([self.candidates(images, b, places[b], closer=True) for b in range(count)])
+        return _best_two([self.candidates(images, b, places[b], matched_filter=True) for b in range(count)])
 
     def candidates(
-        self, images: list[Tensor], b: int, near: Tensor | None = None, *, closer: bool = False
+        self, images: list[Tensor], b: int, near: Tensor | None = None, *, matched_filter: bool = False
     ) -> tuple[Estimate, Tensor]:
-        """Template ``b`` in frames given as ``halvings`` (1 or B, 1, h, w): a few distinct poses (K, ...) and their
-        scores (K,), the best first; of equally good ones those nearest to ``near`` (2,) or (3,) first.
+        """Template ``b`` in the levels ``images`` (1 or B, 1, h, w) of a frame: a few distinct poses (K, ...) and their
+        scores (K,), the best first; of those as good the nearest to ``near`` (2,) or (3,) first.
 
-        ``closer``: when they are ambiguous, or none was near the best, places with the right details come in as well.
+        ``matched_filter``: when they are ambiguous, or none was near the best, those of its places come in as well.
         """
         images = [image if len(image) == 1 else image[b : b + 1] for image in images]
         reference = self.pyramids[b][0]
+        radius = reference.place.radius
         pose = self.coarse(images, b)
-        chosen, rest = pose[:FINALISTS], pose[FINALISTS:]
-        if near is not None and len(rest):
-            chosen = torch.cat((chosen, rest[distance(rest, near, reference.place.radius).argmin()][None]))
-        found = self.refined(images[0], b, chosen)
-        best = _decide([ranked(found, reference.place.radius)])
-        slid = distance(best.pose, chosen, reference.place.radius).min() > LONGEST_WAY  # perhaps past the place
-        if closer and bool(best.ambiguous | slid):
-            turns = both_ways(pose[:, 2], reference.place.radius)
-            more = self.refined(images[0], b, details(reference, images[0][0, 0], turns, DETAILED))
-            found = Estimate(*map(torch.cat, zip(found[0], more[0], strict=True))), torch.cat((found[1], more[1]))
-        return ranked(found, reference.place.radius, near)
+        finalists, others = pose[:FINALISTS], pose[FINALISTS:]
+        if near is not None and len(others):
+            nearest = pose_distance(others, near, radius=radius).argmin()
+            finalists = torch.cat((finalists, others[nearest][None]))
+        found = self.refined(images[0], b, finalists)
+        best = _best_two([ranked(found, radius=radius)])
+        slid = pose_distance(best.pose, finalists, radius=radius).min() > RESTART_DISTANCE  # perhaps past the place
+        if matched_filter and bool(best.ambiguous | slid):
+            angles = with_half_turns(pose[:, 2], radius)
+            matches = whitened_matches(reference, images[0][0, 0], angles=angles, most=FILTER_MATCHES)
+            estimate, score = self.refined(images[0], b, matches)
+            found = Estimate(*map(torch.cat, zip(found[0], estimate, strict=True))), torch.cat((found[1], score))
+        return ranked(found, radius=radius, near=near)
 
     def refined(self, image: Tensor, b: int, pose: Tensor) -> tuple[Estimate, Tensor]:
         """Template ``b`` aligned with ``image`` (1, 1, H, W) from poses (K, 3): estimate and score."""
         copies = _copies(self.pyramids[b][0], len(pose))
         estimate = solve(copies, image, pose, self.settings)
-        for _ in range(REPEATS):  # where the texture lets a pose slide, iterations are spent on the way
-            way = distance(estimate.displacement, torch.zeros_like(pose), copies.place.radius)
-            far = (way > LONGEST_WAY).nonzero()[:, 0]
+        for _ in range(MAX_RESTARTS):  # where the texture lets a pose slide, iterations are spent on the way
+            distance = pose_distance(estimate.displacement, torch.zeros_like(pose), radius=copies.place.radius)
+            far = (distance > RESTART_DISTANCE).nonzero()[:, 0]
             if len(far) == 0:
                 break
             again = solve(_copies(copies, len(far)), image, estimate.pose[far], self.settings)
-            estimate = Estimate(*(e.index_copy(0, far, a) for e, a in zip(estimate, again, strict=True)))
-        return estimate, likeness(copies, image, estimate.pose)
+            estimate = estimate.put(far, again)
+        return estimate, detrended_zncc_at(copies, image, estimate.pose)
 
     def coarse(self, images: list[Tensor], b: int) -> Tensor:
         """Poses (K, 3) of template ``b`` in one frame before they are refined at its full resolution, best first."""
         references, bank = self.pyramids[b], self.banks[b]
         top = len(references) - 1
         pose, score = bank.candidates(images[top][0, 0], CANDIDATES)
-        pose = pose[foremost(pose, score, references[top].place.radius, NEIGHBOURS, HANDICAP[0])]
+        pose = pose[shortlist(pose, score, radius=references[top].place.radius, margin=GRID_MARGIN)]
         for level in range(top, min(top, 1) - 1, -1):  # the last level is left to the refinement
-            pose = descend(references[level], images[level], pose)
+            pose = aligned(references[level], images[level], pose)
             pose = pose * pose.new_tensor((2.0, 2.0, 1.0)) if level else pose
         return torch.cat((pose[:, :2], unwrap(pose[:, 2:], torch.zeros_like(pose[:, 2:]))), -1)
 
 
-def halvings(image: Tensor, levels: int) -> list[Tensor]:
+def image_pyramid(image: Tensor, levels: int) -> list[Tensor]:
     """``image`` (B, 1, H, W) and its ``levels`` - 1 coarser ones."""
     images = [image]
     while len(images) < levels:
-        images.append(halve(images[-1]))
+        images.append(downsample(images[-1]))
     return images
 
 
-def descend(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
-    """Candidates (K, 3) of one template brought to their best nearby: those that differ and may be it, best first."""
+def aligned(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
+    """Candidates (K, 3) of one template aligned with one level: the SURVIVORS of them, best first."""
     copies = _copies(reference, len(pose))
     state, *_ = iterate(copies, image, "bilinear", State.start(pose), COARSE_TOLERANCE, COARSE_ITERATIONS)
-    before, after = likeness(copies, image, pose), likeness(copies, image, state.pose)
-    pose = torch.where((after > before)[:, None], state.pose, pose)
-    return pose[foremost(pose, torch.maximum(before, after), reference.place.radius, DISTINCT, HANDICAP[1])[:SURVIVORS]]
+    before, after = detrended_zncc_at(copies, image, pose), detrended_zncc_at(copies, image, state.pose)
+    pose, score = torch.where((after > before)[:, None], state.pose, pose), torch.maximum(before, after)
+    return pose[shortlist(pose, score, radius=reference.place.radius, margin=ALIGNED_MARGIN)[:SURVIVORS]]
 
 
-def likeness(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
-    """Correlation (K,) off the plane of light at poses (K, 3); -1 where too little of the template is in the image."""
-    warp = reference.warps(pose)
-    weight = reference.weight * inside(warp, reference.grid.pixels, (image.shape[-2], image.shape[-1]))
-    score = flat_correlation(reference, weight, Sampler.of(image)(warp, reference.grid.pixels))
-    enough = (weight.sum(-1) >= LEAST_SEEN * reference.weight.sum(-1)) & pose.isfinite().all(-1)
-    return torch.where(enough, score, -1.0)
+def detrended_zncc_at(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
+    """Detrended ZNCC (K,), off the plane of light, at poses (K, 3); -1 where too little of the template is visible."""
+    warp, pixels = reference.warps(pose), reference.grid.pixels
+    weight = reference.weight * inside(warp, pixels, (image.shape[-2], image.shape[-1]))
+    score = detrended_zncc(reference, weight, Sampler.of(image)(warp, pixels))
+    visible = weight.sum(-1) >= LEAST_VISIBLE * reference.weight.sum(-1)
+    return torch.where(visible & pose.isfinite().all(-1), score, -1.0)
 
 
-def flat_correlation(reference: Reference, weight: Tensor, g: Tensor) -> Tensor:
-    """Correlation (K,) of the templates and patches g (K, N) under ``weight`` (K, N) without their planes 1, u, v."""
+def detrended_zncc(reference: Reference, weight: Tensor, g: Tensor) -> Tensor:
+    """ZNCC (K,) of the templates and patches g (K, N) under ``weight`` (K, N) off the planes 1, u, v."""
     planes = torch.cat((torch.ones_like(g)[:, None], reference.uv), 1)
     weighted = planes * weight[:, None]
     inverse, _ = safe_inverse(weighted @ planes.mT)
@@ -225,68 +224,74 @@ def flat_correlation(reference: Reference, weight: Tensor, g: Tensor) -> Tensor:
     return torch.where(norm > 1e-12 * (weight * g * g).sum(-1), score, 0.0).clamp(-1, 1)
 
 
-def distance(a: Tensor, b: Tensor, radius: Tensor) -> Tensor:
-    """How far poses (..., 3) are apart at most at ``radius`` px, (...): the turn is left out if ``b`` is (..., 2)."""
+def pose_distance(a: Tensor, b: Tensor, *, radius: Tensor) -> Tensor:
+    """How far poses (..., 3) are apart at most at ``radius`` px, (...): |dx, dy| + radius |dtheta|, without the angle
+    if ``b`` is (..., 2)."""
     step = a[..., : b.shape[-1]] - b
-    turn = unwrap(step[..., 2:], torch.zeros_like(step[..., 2:])).abs().sum(-1)
-    return torch.hypot(step[..., 0], step[..., 1]) + radius * turn
+    angle = unwrap(step[..., 2:], torch.zeros_like(step[..., 2:])).abs().sum(-1)
+    return torch.hypot(step[..., 0], step[..., 1]) + radius * angle
 
 
-def distinct(pose: Tensor, score: Tensor, radius: Tensor, apart: float = DISTINCT) -> Tensor:
-    """Indices of the poses (K, 3) that are ``apart`` px from all of a better score (K,), the best first."""
+def non_maximum_suppression(pose: Tensor, score: Tensor, *, radius: Tensor) -> Tensor:
+    """Indices of the poses (K, 3) that are SUPPRESSION px at ``radius`` from all of a better score (K,), best first."""
     order = score.argsort(descending=True, stable=True)
-    same = distance(pose[order][:, None], pose[order][None], radius) < apart
-    return order[~same.tril(-1).any(-1)]
+    near = pose_distance(pose[order][:, None], pose[order][None], radius=radius) < SUPPRESSION
+    return order[~near.tril(-1).any(-1)]
 
 
-def both_ways(turn: Tensor, radius: Tensor) -> Tensor:
-    """The first TURNS of ``turn`` (K,) rad that are DISTINCT px apart at ``radius``, and the same turned by half."""
-    axis = F.pad(2 * turn[:, None], (2, 0))  # a turn and its half turn are one
-    first = turn[distinct(axis, -torch.arange(len(turn), device=turn.device), radius / 2)[:TURNS]]
+def shortlist(pose: Tensor, score: Tensor, *, radius: Tensor, margin: float) -> Tensor:
+    """Indices of the poses (K, 3) whose score (K,) is high enough to go on with, best first, after suppression.
+
+    s >= max(LEAST_SCORE, s_best - ``margin``), CANDIDATES at most; and the FEWEST best before suppression, so that a
+    runner-up is among them.
+    """
+    top, index = score.topk(min(2 * CANDIDATES, len(score)))
+    high = top >= (top[0] - margin).clamp(min=LEAST_SCORE)
+    high[:FEWEST] = True
+    index = index[high]
+    return index[non_maximum_suppression(pose[index], score[index], radius=radius)[:CANDIDATES]]
+
+
+def with_half_turns(angle: Tensor, radius: Tensor) -> Tensor:
+    """The first FILTER_ANGLES of ``angle`` (K,) rad that are SUPPRESSION px apart at ``radius``, then their half turns:
+    an angle and its half turn count as one."""
+    axis = F.pad(2 * angle[:, None], (2, 0))
+    by_order = -torch.arange(len(angle), device=angle.device)
+    first = angle[non_maximum_suppression(axis, by_order, radius=radius / 2)[:FILTER_ANGLES]]
     return unwrap(torch.cat((first, first + math.pi)), torch.zeros_like(first[:1]))
 
 
-def ranked(found: tuple[Estimate, Tensor], radius: Tensor, near: Tensor | None = None) -> tuple[Estimate, Tensor]:
-    """Distinct ones of found poses (K, ...) with their scores (K,), the best first; of equally good ones those nearest
-    to ``near`` (2,) or (3,) first."""
+def ranked(found: tuple[Estimate, Tensor], *, radius: Tensor, near: Tensor | None = None) -> tuple[Estimate, Tensor]:
+    """Distinct ones of found poses (K, ...) with their scores (K,), the best first; of those as good the nearest to
+    ``near`` (2,) or (3,) first."""
     estimate, score = found
-    order = distinct(estimate.pose, score, radius)
+    order = non_maximum_suppression(estimate.pose, score, radius=radius)
     if near is not None:
-        away = distance(estimate.pose[order], near, radius)
-        away = torch.where(as_good(score[order], score[order[0]]), away, torch.inf)
-        order = order[away.argsort(stable=True)]
-    return Estimate(*(value[order] for value in estimate)), score[order]
+        distance = pose_distance(estimate.pose[order], near, radius=radius)
+        distance = torch.where(within_margin(score[order], score[order[0]]), distance, torch.inf)
+        order = order[distance.argsort(stable=True)]
+    return estimate.at(order), score[order]
 
 
-def foremost(pose: Tensor, score: Tensor, radius: Tensor, apart: float, behind: float) -> Tensor:
-    """``distinct`` of those whose score (K,) is not too low, nor more than ``behind`` the best one; CANDIDATES at most,
-    and at least FEWEST before duplicates are dropped, so that a runner-up is among them."""
-    top, first = score.topk(min(2 * CANDIDATES, len(score)))
-    hopeful = top >= (top[0] - behind).clamp(min=HOPELESS)
-    hopeful[:FEWEST] = True
-    first = first[hopeful]
-    return first[distinct(pose[first], score[first], radius, apart)[:CANDIDATES]]
+def within_margin(score: Any, best: Any) -> Any:
+    """Whether a ``score`` s is as good as the ``best`` one, 1 - s <= a (1 - s_best) + b, any shape: bool."""
+    a, b = AMBIGUITY_MARGIN
+    return 1 - score <= a * (1 - best) + b
 
 
 def _copies(reference: Reference, count: int) -> Reference:
-    return reference.select(torch.zeros(count, dtype=torch.int64, device=reference.K.device))
+    return reference.select(torch.zeros(count, dtype=torch.int64, device=reference.place.radius.device))
 
 
-def as_good(score: Any, best: Any) -> Any:
-    """Whether a ``score`` tells no worse match than the ``best`` one, any shape: bool."""
-    factor, slack = AS_GOOD
-    return 1 - score <= factor * (1 - best) + slack
-
-
-def _decide(found: list[tuple[Estimate, Tensor]]) -> Located:
-    """Best and runner-up of each template's candidates (K, ...)."""
+def _best_two(found: list[tuple[Estimate, Tensor]]) -> Located:
+    """Best and runner-up of each template's candidates (K, ...) and scores (K,), the best first."""
 
     def pick(rank: int) -> tuple[Estimate, Tensor]:
-        rows = [(e, s, min(rank, len(s) - 1)) for e, s in found]
-        fields = zip(*([value[k] for value in e] for e, _, k in rows), strict=True)
-        score = torch.stack([s[k] if k == rank else torch.full_like(s[0], -1.0) for _, s, k in rows])
-        return Estimate(*map(torch.stack, fields)), score
+        rows = [(estimate, score, min(rank, len(score) - 1)) for estimate, score in found]
+        fields = zip(*([value[k] for value in estimate] for estimate, _, k in rows), strict=True)
+        scores = [score[k] if k == rank else torch.full_like(score[0], -1.0) for _, score, k in rows]
+        return Estimate(*map(torch.stack, fields)), torch.stack(scores)
 
     (best, score), (second, other) = pick(0), pick(1)
-    alike = as_good(torch.minimum(score, other), torch.maximum(score, other))
-    return Located(best, score, second, other, alike | (best.status == Status.LOW_TEXTURE))
+    ambiguous = within_margin(torch.minimum(score, other), torch.maximum(score, other))
+    return Located(best, score, second, other, ambiguous | (best.status == Status.LOW_TEXTURE))

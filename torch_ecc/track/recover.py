@@ -12,7 +12,7 @@ from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.search.locate import LEAST_SEEN, Locator, as_good, halvings
+from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, within_margin
 from torch_ecc.search.nearby import Nearby
 
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
@@ -25,7 +25,7 @@ SELDOM = 16  # frames between two searches for what has been lost for long
 def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
     """Templates that were not found, or look less like themselves than ``usual`` (R,): perhaps a wrong place."""
     each = zip(estimate.status.tolist(), estimate.score.tolist(), usual.tolist(), strict=True)
-    return [status > Status.MAX_ITERATIONS or not as_good(score, most) for status, score, most in each]
+    return [status > Status.MAX_ITERATIONS or not within_margin(score, most) for status, score, most in each]
 
 
 class Recovery:
@@ -68,7 +68,7 @@ class Recovery:
         index = torch.tensor(due, device=start.device)
         view = image if len(image) == 1 else image[index]
         found = self.surroundings(due).find(self.reference.select(index), view, start[index], self.settings)
-        known = (found.status == Status.CONVERGED) & as_good(found.score, usual[index])
+        known = (found.status == Status.CONVERGED) & within_margin(found.score, usual[index])
         return estimate.put(index[known], found.at(known))
 
     def search_anywhere(
@@ -76,12 +76,12 @@ class Recovery:
     ) -> Estimate:
         """Third attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
         locator, (pose, usual) = self.locator(r, (images[0].shape[-2], images[0].shape[-1])), last
-        images += halvings(images[-1], locator.levels - len(images) + 1)[1:]
+        images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
         found, score = locator.candidates(views, 0, pose[r])
         if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * usual[r]:
             return estimate
-        if Status.good(estimate.status[r]) and as_good(estimate.score[r], found.score[0]):
+        if Status.good(estimate.status[r]) and within_margin(estimate.score[r], found.score[0]):
             return estimate
         best = found._replace(pose=torch.cat((found.pose[:, :2], unwrap(found.pose[:, 2:], pose[r, 2])), -1))
         index = torch.tensor([r], device=pose.device)
@@ -102,5 +102,5 @@ class Recovery:
             if len(self.locators) >= AT_ONCE:
                 del self.locators[next(iter(self.locators))]
             template = self.reference.select(torch.tensor([r], device=self.reference.K.device))
-            self.locators[r] = Locator(template, size, replace(self.settings, min_visible=LEAST_SEEN))
+            self.locators[r] = Locator(template, size, replace(self.settings, min_visible=LEAST_VISIBLE))
         return self.locators[r]

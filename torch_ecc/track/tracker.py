@@ -20,7 +20,7 @@ from torch_ecc.core.pyramid import SMALLEST_COARSE, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, iterate
-from torch_ecc.search.locate import LEAST_SEEN, Located, Locator, halvings, likeness
+from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
 from torch_ecc.track.recover import Recovery, suspect
 
 PREDICTIONS = ("hold", "velocity")
@@ -129,7 +129,7 @@ class Tracker(nn.Module):
         h, w = gray.shape[-2:]
         tracker = cls(gray, [((w - 1) / 2, (h - 1) / 2)] * len(gray), (h, w), **options)
         view = as_gray("find", "frame", frame, tracker.pose.device)
-        settings = replace(tracker.settings, min_visible=LEAST_SEEN)
+        settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
         tracker.frame_shape = tuple(view.shape)
         tracker.start.copy_(located.pose)
@@ -254,7 +254,7 @@ class Tracker(nn.Module):
         """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are. What a level has found
         is kept only if it looks better to the next finer one than its start: fine texture is not there in a coarse
         level, which then leads anywhere."""
-        images[:] = halvings(images[0].float(), self.levels) if self.levels > 1 else images
+        images[:] = image_pyramid(images[0].float(), self.levels) if self.levels > 1 else images
         most = self.settings.max_iterations
         for level in range(self.levels - 1, 0, -1):
             scale, double = (pose.new_tensor((s, s, 1.0)) for s in (2.0**level, 2.0))
@@ -262,7 +262,7 @@ class Tracker(nn.Module):
                 self.references[level], images[level], "bilinear", State.start(pose / scale), COARSE_TOLERANCE, most
             )
             finer = self.references[level - 1], images[level - 1]
-            better = likeness(*finer, state.pose * double) > likeness(*finer, pose / scale * double)
+            better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
         return solve(self.references[0], images[0], pose, self.settings, self._buffers["start"])
 

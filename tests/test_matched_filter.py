@@ -1,4 +1,4 @@
-"""Laws of the search among places that look alike: the details decide, wherever and however they are turned."""
+"""Laws of the search among places that look alike: what the frame does not repeat decides, at any place and angle."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 
 from torch_ecc import Locator, Status, align, prepare
 from torch_ecc.core.reference import blur
-from torch_ecc.search.bank import details
-from torch_ecc.search.locate import LONGEST_WAY, both_ways, halvings
+from torch_ecc.search.locate import image_pyramid, with_half_turns
+from torch_ecc.search.matched_filter import whitened_matches
 
 SIZE, HALF = (240, 320), 30
 
@@ -56,11 +56,11 @@ def off(pose: torch.Tensor, truth: torch.Tensor) -> float:
     return float((pose - truth)[0, :2].norm()) + HALF * math.sqrt(2) * abs(turn)
 
 
-def test_the_details_tell_what_the_coarse_search_cannot():
+def test_the_matched_filter_tells_what_the_coarse_search_cannot():
     alone = []
     for template, frame, truth in trials()[:3]:
         locator = Locator(prepare(template), (frame.shape[-2], frame.shape[-1]))
-        first, _ = locator.candidates(halvings(frame[None, None], locator.levels), 0)
+        first, _ = locator.candidates(image_pyramid(frame[None, None], locator.levels), 0)
         alone.append(off(first.pose[:1], truth))
         found = locator(frame)
         assert found.status == Status.CONVERGED
@@ -68,29 +68,29 @@ def test_the_details_tell_what_the_coarse_search_cannot():
     assert sum(e > 5 for e in alone) >= 2  # among such lines the coarse search is lost
 
 
-def test_turns_are_looked_at_both_ways():
-    """Each once, in (-pi, pi], whichever of a turn and its half turn comes first."""
-    turns = both_ways(torch.tensor([3.0, -0.1416, 0.5, 3.001, 0.501, -2.0]), torch.tensor(40.0))
-    assert turns.abs().max() <= math.pi
-    assert torch.allclose(turns[:3], torch.tensor([3.0, 0.5, -2.0]))
-    assert torch.allclose((turns[3:] - turns[:3]).abs(), torch.tensor(math.pi))
+def test_angles_come_with_their_half_turns():
+    """Each once, in (-pi, pi], whichever of an angle and its half turn comes first."""
+    angles = with_half_turns(torch.tensor([3.0, -0.1416, 0.5, 3.001, 0.501, -2.0]), torch.tensor(40.0))
+    assert angles.abs().max() <= math.pi
+    assert torch.allclose(angles[:3], torch.tensor([3.0, 0.5, -2.0]))
+    assert torch.allclose((angles[3:] - angles[:3]).abs(), torch.tensor(math.pi))
 
 
-def test_details_are_found_at_full_resolution():
+def test_rare_texture_is_found_at_full_resolution():
     """The first place is the right one, to the nearest px, at the right one of several turns."""
     turns = torch.arange(4) * math.pi / 2
     for template, frame, truth in trials():
-        assert off(details(prepare(template), frame, turns, 3)[:1], truth) < 1
+        assert off(whitened_matches(prepare(template), frame, angles=turns, most=3)[:1], truth) < 1
 
 
 def test_gain_offset_and_a_move_of_the_frame_change_no_place():
     template, frame, truth = trials()[0]
     reference, turns = prepare(template), torch.zeros(1)
-    base = details(reference, frame, turns, 1)
+    base = whitened_matches(reference, frame, angles=turns, most=1)
     assert off(base, truth) < 1
     for gain, offset in ((0.1, 7.0), (100.0, -3000.0)):
-        assert (details(reference, frame * gain + offset, turns, 1) - base).abs().max() < 0.05
-    rolled = details(reference, frame.roll((17, 45), (0, 1)), turns, 1)
+        assert (whitened_matches(reference, frame * gain + offset, angles=turns, most=1) - base).abs().max() < 0.05
+    rolled = whitened_matches(reference, frame.roll((17, 45), (0, 1)), angles=turns, most=1)
     assert (rolled - base - torch.tensor([[45.0, 17.0, 0.0]])).abs().max() < 0.05
 
 
@@ -101,15 +101,15 @@ def test_a_mask_and_a_centre_are_honoured():
     soiled = torch.where(mask, template, 255 * torch.rand(template.shape, generator=torch.Generator().manual_seed(0)))
     reference = prepare(soiled, mask=mask, centre=torch.tensor([[5.0, -8.0]]))
     moved = truth + torch.tensor([[5.0, -8.0, 0.0]])
-    assert off(details(reference, frame, torch.zeros(1), 1), moved) < 1
+    assert off(whitened_matches(reference, frame, angles=torch.zeros(1), most=1), moved) < 1
 
 
 @pytest.mark.parametrize("image", [torch.full(SIZE, 90.0), lines(0, faint=0.0), torch.rand(50, 40)])
-def test_where_there_are_none_the_answer_is_finite(image):
+def test_where_nothing_is_rare_the_answer_is_finite(image):
     """Nothing, nothing but lines, and less than the template."""
     reference = prepare(patch(noisy(lines(0), 1), 100, 100))
-    assert details(reference, image, torch.tensor([0.0, 1.0]), 4).shape == (4, 3)
-    assert details(reference, image, torch.tensor([0.0, 1.0]), 4).isfinite().all()
+    assert whitened_matches(reference, image, angles=torch.tensor([0.0, 1.0]), most=4).shape == (4, 3)
+    assert whitened_matches(reference, image, angles=torch.tensor([0.0, 1.0]), most=4).isfinite().all()
 
 
 def test_a_refinement_that_slides_far_begins_anew():
@@ -121,5 +121,5 @@ def test_a_refinement_that_slides_far_begins_anew():
     tracked = align(reference, image, truth)
     start = truth + torch.tensor([[0.0, 1.6, 0.0]])
     found, _ = locator.refined(image, 0, start)
-    assert found.displacement[0, :2].norm() <= LONGEST_WAY
+    assert found.displacement[0, :2].norm() <= 1.0
     assert off(found.pose, tracked.pose) < 0.01
