@@ -7,12 +7,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Status, Track
+from torch_ecc.paper.result import Advance, Table, cells
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Motion
 from torch_ecc.sim.camera.light import Light
@@ -33,6 +35,7 @@ QUIET = Floor(speed_um_s=0.78)  # VC-G: an isolated table (Amick et al., SPIE 59
 ON_TABLE: Mapping[str, Any] = {"floor": QUIET, "column_hz": 90.0, "exposure_s": 0.0}
 CAMERA_START_S = 0.2137  # of the stage's clock; the sensors start with the stage
 METHODS: Mapping[str, Mapping[str, Any]] = {"ECC": {}}
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,33 @@ def acquire(command: Tensor, bench: Bench, tick: Callable[[], None]) -> Acquisit
         motions[name] = Motion(times, torch.where(Status.good(track.status), pose, torch.nan))
         sigma[name] = scale.covariance(track.covariance[:, 0]).diagonal(dim1=-2, dim2=-1).sqrt()
     return Acquisition(motions, sigma, read, Motion(times, truth), motion, offset, seconds, first)
+
+
+def acquired_once(simulate: Callable[[bool, Advance], T]) -> Callable[[bool, Advance], T]:
+    """``simulate(quick, advance)`` at the first call only; later ones get what that one returned."""
+    kept: dict[bool, T] = {}
+
+    @wraps(simulate)
+    def recall(quick: bool, advance: Advance) -> T:
+        if quick not in kept:
+            kept[quick] = simulate(quick, advance)
+        return kept[quick]
+
+    return recall
+
+
+def microscope(quick: bool, **options: Any) -> Microscope:
+    """The microscope on its table; ``quick``: it reads a smaller part of its sensor."""
+    return Microscope(region_px=(240, 320) if quick else (480, 640), **ON_TABLE, **options)
+
+
+def times(acquired: Mapping[str, Acquisition]) -> Table:
+    """Seconds of each part of every simulation, and of all."""
+    first = next(iter(acquired.values()))
+    rows = [(name, *cells((*a.seconds.values(), sum(a.seconds.values())), ".1f")) for name, a in acquired.items()]
+    frames, samples, (h, w) = len(first.truth.time_s), len(first.sensors.time_s), first.first.shape
+    title = f"Time in s: {frames} frames of {w}x{h} px and {samples} samples of three sensors"
+    return Table(title + (", each" if len(rows) > 1 else ""), ("", *first.seconds, "all"), rows)
 
 
 def tracker_of(first: Tensor, **options: Any) -> Tracker:

@@ -9,13 +9,13 @@ from torch import Tensor
 from torch_ecc.commands.servo import draw_three_steps
 from torch_ecc.commands.servo_job import ServoJob, prepare_parts, run_alignment, setting
 from torch_ecc.commands.servo_pictures import draw_errors
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
 
 EXPECTED = 260  # frames, for the progress only
 LIMIT_PX, LIMIT_DEG = 0.1, 0.02
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """One alignment on the simulated workstation; ``quick`` at half the resolution."""
     scale = 0.5 if quick else 1.0
     job = ServoJob.read(setting(scale))
@@ -35,7 +35,7 @@ def run(quick: bool, advance: Advance) -> Outcome:
         for title, log in zip(titles, logs, strict=False)
     ]
     header = ("step", "frames", "s", "x px", "y px", "theta deg", "x px, end", "y px, end", "theta deg, end")
-    return Outcome(
+    return Experiment(
         "fig12",
         "Fig. 12: automatic alignment of probe and substrate",
         [
@@ -46,12 +46,12 @@ def run(quick: bool, advance: Advance) -> Outcome:
         ],
         [Table("Errors as measured, when each step begins and ends", header, rows)],
         [
-            Record("aligned", float(found.alignment.aligned), "", "higher", 1.0),
-            Record("substrate, true error", off, "px", tolerance=LIMIT_PX),
-            Record("substrate, true error in nm", nm * off, "nm"),
-            Record("substrate, true error of theta", math.degrees(abs(theta)), "deg", tolerance=LIMIT_DEG),
-            Record("tip off its landing point", miss, "px", tolerance=LIMIT_PX),
-            Record("tip off its landing point in nm", nm * miss, "nm"),
+            Number("aligned", float(found.alignment.aligned), "", "higher", 1.0),
+            Number("substrate, true error", off, "px", tolerance=LIMIT_PX),
+            Number("substrate, true error in nm", nm * off, "nm"),
+            Number("substrate, true error of theta", math.degrees(abs(theta)), "deg", tolerance=LIMIT_DEG),
+            Number("tip off its landing point", miss, "px", tolerance=LIMIT_PX),
+            Number("tip off its landing point in nm", nm * miss, "nm"),
         ],
         [
             "The paper shows pictures of its workstation and gives no numbers: the limits are this project's own.",

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from torch_ecc.commands.servo_pictures import draw_errors, draw_velocities
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
 from torch_ecc.paper.servo_trials import Single, single
 from torch_ecc.servo.record import decay_rate
 
@@ -31,7 +31,7 @@ GAIN, SCALE = 2.0, 0.5  # 1/s; px of the quick runs over those of the others
 QUICK = ("as it is", "scale 20 % too large, axes 5 deg off")
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """A run without noise, and one for each wrong belief; ``quick``: only one of these, at half the resolution."""
     scale, names = (SCALE, QUICK) if quick else (1.0, tuple(WRONG))
     clean = single(scale, **_changes(CLEAN, scale))
@@ -45,17 +45,17 @@ def run(quick: bool, advance: Advance) -> Outcome:
     usual = runs["as it is"]
     title = ["Substrate"]
     records = [
-        Record(f"decay of {name}, off lambda, no noise", value, "%", tolerance=5.0)
+        Number(f"decay of {name}, off lambda, no noise", value, "%", tolerance=5.0)
         for name, value in zip(("x", "y", "theta"), off.tolist(), strict=True)
     ]
     every = [clean, *runs.values()]
     records += [
-        Record("largest velocity over its limit", max(r.speed for r in every), "", tolerance=1.0 + 1e-9),
-        Record("largest acceleration over its limit", max(r.acceleration for r in every), "", tolerance=1.0 + 1e-9),
-        Record("runs aligned", float(sum(r.result.aligned for r in every)), "", "higher", float(len(every))),
-        Record("last velocity over the largest", _last(usual), "", tolerance=0.01),
+        Number("largest velocity over its limit", max(r.speed for r in every), "", tolerance=1.0 + 1e-9),
+        Number("largest acceleration over its limit", max(r.acceleration for r in every), "", tolerance=1.0 + 1e-9),
+        Number("runs aligned", float(sum(r.result.aligned for r in every)), "", "higher", float(len(every))),
+        Number("last velocity over the largest", _last(usual), "", tolerance=0.01),
     ]
-    return Outcome(
+    return Experiment(
         "fig13",
         "Fig. 13: velocities of visual servoing",
         [

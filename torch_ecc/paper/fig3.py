@@ -12,7 +12,7 @@ from torch_ecc.core.pose import compose
 from torch_ecc.paper import scheme
 from torch_ecc.paper.fig3_plot import draw_curves, draw_templates
 from torch_ecc.paper.methods import METHODS, Follower, errors, largest
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table, counter
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, counter
 from torch_ecc.plots.style import styled
 from torch_ecc.sim.camera.camera import Camera
 
@@ -34,7 +34,7 @@ class Spread(NamedTuple):
     reflected: Tensor
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Track and draw. ``quick``: half a cycle (the other half goes back the same way), the text's amplitudes only."""
     motions = (scheme.TEXT,) if quick else (scheme.TEXT, scheme.CAPTION)
     paths = {m: m.path()[: m.points // 2] if quick else m.path() for m in motions}
@@ -48,7 +48,7 @@ def run(quick: bool, advance: Advance) -> Outcome:
     tables = [_table(motion, e) for motion, e in found.items()] + [_spread_table(spread)]
     records = [r for motion, e in found.items() for r in _records(motion, e)]
     title = "Fig. 3: uneven illumination"
-    return Outcome("fig3", title, pictures, tables, records, _remarks(found, spread), SEED)
+    return Experiment("fig3", title, pictures, tables, records, _remarks(found, spread), SEED)
 
 
 def cameras() -> dict[str, Camera]:
@@ -151,7 +151,7 @@ def _range(values: Tensor) -> str:
     return f"{values.quantile(0.5):.4f} ({values.min():.4f} to {values.max():.4f})"
 
 
-def _records(motion: scheme.Motion, found: Errors) -> list[Record]:
+def _records(motion: scheme.Motion, found: Errors) -> list[Number]:
     records = []
     for camera, by_method in found.items():
         for name, error in by_method.items():
@@ -159,11 +159,11 @@ def _records(motion: scheme.Motion, found: Errors) -> list[Record]:
             paper = PAPER.get(name) if camera == "with UI" else None
             for k, (value, unit) in enumerate(zip(largest(error), ("px", "deg"), strict=True)):
                 label = f"fig3 {motion.degrees:g} deg, {name}, {camera}, largest {'theta' if k else 'x, y'}"
-                records.append(Record(label, value, unit, tolerance=limit and limit[k], paper=paper and paper[k]))
+                records.append(Number(label, value, unit, tolerance=limit and limit[k], paper=paper and paper[k]))
         if camera == "with UI":
             ratio = largest(by_method["ref34"])[1] / largest(by_method["gain"])[1]
             label = f"fig3 {motion.degrees:g} deg, theta error of ref34 over that of gain, with UI"
-            records.append(Record(label, ratio, "1", "higher", 2.0, PAPER["ref34"][1] / PAPER["gain"][1]))
+            records.append(Number(label, ratio, "1", "higher", 2.0, PAPER["ref34"][1] / PAPER["gain"][1]))
     return records
 
 

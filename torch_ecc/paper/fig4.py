@@ -14,7 +14,7 @@ from torch_ecc.paper import scheme
 from torch_ecc.paper.bound import QUANTISATION, cramer_rao
 from torch_ecc.paper.fig4_plot import draw_boxes
 from torch_ecc.paper.methods import METHODS, Follower, errors
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table, counter
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, counter
 from torch_ecc.plots.style import styled
 from torch_ecc.sim.camera.camera import Camera
 from torch_ecc.sim.camera.sensor import noise_sigma
@@ -51,7 +51,7 @@ class Noisy(NamedTuple):
         return float(self.ratio(method).square().mean().sqrt())
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Align and draw. ``quick``: every fourth pose of the cycle, noise-free template only."""
     path = scheme.TEXT.path()
     poses = torch.arange(1, len(path), 4 if quick else 1)
@@ -62,7 +62,7 @@ def run(quick: bool, advance: Advance) -> Outcome:
         pictures = [_picture(kind, noisy) for kind, noisy in found.items()]
     tables = [_table(kind, noisy) for kind, noisy in found.items()]
     records = [record for kind, noisy in found.items() for record in _records(kind, noisy)]
-    return Outcome("fig4", "Fig. 4: image noise", pictures, tables, records, _remarks(found), SEED)
+    return Experiment("fig4", "Fig. 4: image noise", pictures, tables, records, _remarks(found), SEED)
 
 
 def _picture(kind: str, found: dict[str, Noisy]) -> Picture:
@@ -134,7 +134,7 @@ def quartiles(error: Tensor) -> Tensor:
     return error.quantile(levels, dim=0).abs().amax(0)
 
 
-def _records(kind: str, found: dict[str, Noisy]) -> list[Record]:
+def _records(kind: str, found: dict[str, Noisy]) -> list[Number]:
     records = []
     for variance, noisy in found.items():
         for name in USED:
@@ -142,11 +142,11 @@ def _records(kind: str, found: dict[str, Noisy]) -> list[Record]:
             limit = RATIO_LIMIT if name == "linear" else None
             box, most = quartiles(error), error.abs().amax(0)
             records += [
-                Record(f"{label}, rms over the bound", noisy.over(name), "1", tolerance=limit),
-                Record(f"{label}, box of x, y", float(box[:2].max()), "px", paper=BOX),
-                Record(f"{label}, largest of x, y", float(most[:2].max()), "px", paper=WHISKER),
-                Record(f"{label}, box of theta", float(box[2]), "deg"),
-                Record(f"{label}, largest of theta", float(most[2]), "deg"),
+                Number(f"{label}, rms over the bound", noisy.over(name), "1", tolerance=limit),
+                Number(f"{label}, box of x, y", float(box[:2].max()), "px", paper=BOX),
+                Number(f"{label}, largest of x, y", float(most[:2].max()), "px", paper=WHISKER),
+                Number(f"{label}, box of theta", float(box[2]), "deg"),
+                Number(f"{label}, largest of theta", float(most[2]), "deg"),
             ]
     return records
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
+from torch_ecc.paper.acquisition import times
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
 from torch_ecc.paper.steps import METHODS, Staircase, staircase
-from torch_ecc.plots.style import new_figure, styled
+from torch_ecc.plots.style import new_figure
 
 CDS, ECC = "#d55e00", "#0072b2"
 REMARKS = (
@@ -16,11 +17,9 @@ REMARKS = (
 )
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """The staircase, drawn as the paper's Fig. 8. ``quick``: dwells of 0.3 s instead of 3 s."""
     found = staircase(quick, advance)
-    with styled():
-        figure = draw(found)
     caption = (
         "Tracking results of ECC and CDS for the angular trajectory, 0.04 deg steps to 0.24 deg and back. The inset "
         "enlarges the highest step."
@@ -29,27 +28,21 @@ def run(quick: bool, advance: Advance) -> Outcome:
     highest = float(found.dwells["CDS"].mean[:, 2].max().rad2deg())
     clock = 1e6 * abs(found.alignment.offset_s - found.acquired.offset_s)
     records = [
-        Record("fig8 lost frames", float(lost), "", tolerance=0.0),
-        Record("fig8 highest step by the CDS, 0.24 deg commanded", highest, "deg", "higher"),
-        Record("fig8 clock offset by the joint estimate, error", clock, "us", tolerance=1000.0),
+        Number("fig8 lost frames", float(lost), "", tolerance=0.0),
+        Number("fig8 highest step by the CDS, 0.24 deg commanded", highest, "deg", "higher"),
+        Number("fig8 clock offset by the joint estimate, error", clock, "us", tolerance=1000.0),
     ]
-    tables = [_table(found), _times(found)]
-    return Outcome("fig8", "Fig. 8: angular trajectory", [Picture("fig8", figure, caption)], tables, records, REMARKS)
+    tables = [_table(found), times({"staircase": found.acquired})]
+    picture = Picture("fig8", draw(found), caption)
+    return Experiment("fig8", "Fig. 8: angular trajectory", [picture], tables, records, REMARKS)
 
 
 def _table(found: Staircase) -> Table:
     rows = []
     for k, level in enumerate(found.levels_deg.tolist()):
-        means = (found.dwells[name].mean[k, 2].rad2deg() for name in ("CDS", *METHODS))
-        rows.append((f"{k}", f"{level:.2f}", *(f"{float(mean):.5f}" for mean in means)))
+        means = (float(found.dwells[name].mean[k, 2].rad2deg()) for name in ("CDS", *METHODS))
+        rows.append((f"{k}", f"{level:.2f}", *cells(means, ".5f")))
     return Table("Mean theta of each step, deg", ("step", "commanded", "CDS", *METHODS), rows)
-
-
-def _times(found: Staircase) -> Table:
-    seconds, (h, w) = found.acquired.seconds, found.acquired.first.shape
-    frames, samples = len(found.acquired.truth.time_s), len(found.sensors.time_s)
-    title = f"Time in s: {frames} frames of {w}x{h} px and {samples} samples of three sensors"
-    return Table(title, tuple(seconds), [tuple(f"{value:.1f}" for value in seconds.values())])
 
 
 def draw(found: Staircase) -> Figure:

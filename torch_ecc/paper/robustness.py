@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table, counter
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, counter
 from torch_ecc.paper.robustness_plot import Panel, draw_panels
 from torch_ecc.paper.scheme import SIZE
 from torch_ecc.paper.trials import (
@@ -92,7 +92,7 @@ REMARKS = (
 )
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Sweep and draw. ``quick``: a sixth of the templates, every other level."""
     count, step = (COUNT // 6, 2) if quick else (COUNT, 1)
     sweeps = {name: s._replace(levels=s.levels[::step]) for name, s in (BASIN | SWEEPS).items()}
@@ -106,12 +106,12 @@ def run(quick: bool, advance: Advance) -> Outcome:
         pictures.append(_samplers(errors))
     tables = [_table(sweeps, found, count), _sampler_table(errors)]
     records = [
-        Record(f"robustness {name}: {sweeps[name].label} up to which {ENOUGH:.0%} are found, {m}", limit, "1", better)
+        Number(f"robustness {name}: {sweeps[name].label} up to which {ENOUGH:.0%} are found, {m}", limit, "1", better)
         for name in sweeps
         for m, limit in limits(sweeps[name], found[name]).items()
         for better in ["lower" if name in ("contrast", "size") else "higher"]
     ]
-    return Outcome("robustness", "Robustness beyond the paper", pictures, tables, records, REMARKS, SEED)
+    return Experiment("robustness", "Robustness beyond the paper", pictures, tables, records, REMARKS, SEED)
 
 
 def limits(swept: Sweep, found: Found) -> dict[str, float]:

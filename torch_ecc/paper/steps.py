@@ -6,19 +6,26 @@ Simulated once for all four figures.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_ecc.paper.acquisition import COMMAND_HZ, ON_TABLE, Acquisition, Bench, acquire, frames_of, zeroed
-from torch_ecc.paper.result import Advance
+from torch_ecc.paper.acquisition import (
+    COMMAND_HZ,
+    Acquisition,
+    Bench,
+    acquire,
+    acquired_once,
+    frames_of,
+    microscope,
+    zeroed,
+)
+from torch_ecc.paper.result import Advance, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Dwells, Motion, dwell_errors
 from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
 from torch_ecc.sim.camera.light import GradientLight, LampDrift, Lights
-from torch_ecc.sim.stage.microscope import Microscope
 
 STEP_DEG, HIGHEST = 0.04, 6
 LEVELS = (*range(HIGHEST + 1), *range(HIGHEST - 1, -1, -1))  # in steps
@@ -52,16 +59,6 @@ class Staircase(NamedTuple):
         return self.dwells[method].mean - self.dwells["CDS"].mean
 
 
-_kept: dict[bool, Staircase] = {}
-
-
-def staircase(quick: bool, advance: Advance) -> Staircase:
-    """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
-    if quick not in _kept:
-        _kept[quick] = _run(0.3 if quick else 3.0, (240, 320) if quick else (480, 640), advance)
-    return _kept[quick]
-
-
 def command(dwell_s: float) -> Tensor:
     """Thirteen dwells of theta at (0, 0): (T, 3) um, um, rad at 1 kHz."""
     theta = math.radians(STEP_DEG) * torch.tensor(LEVELS, dtype=torch.float64)
@@ -69,20 +66,17 @@ def command(dwell_s: float) -> Tensor:
     return torch.stack((0 * turn, 0 * turn, turn), -1)
 
 
-def _run(dwell_s: float, region: tuple[int, int], advance: Advance) -> Staircase:
-    microscope = Microscope(zoom=ZOOM, region_px=region, view_um=VIEW_UM, **ON_TABLE)
-    bench, path = Bench(microscope=microscope, methods=METHODS), command(dwell_s)
-    total, done = frames_of(path, bench), 0
-    bench = replace(bench, gain=GAIN, light=Lights((GradientLight(), LampDrift(LAMP, period=2.2 * total))))
-
-    def tick() -> None:
-        nonlocal done
-        done += 1
-        advance(min(done, total), total)
-
-    acquired = acquire(path, bench, tick)
-    angle, rest = microscope.axis_angle, dwell_s / 4  # the angle is known from the circles
-    turn, calibration = Calibration(1.0, angle), Calibration(microscope.um_per_px, angle)
+@acquired_once
+def staircase(quick: bool, advance: Advance) -> Staircase:
+    """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
+    dwell_s = 0.3 if quick else 3.0
+    view, path = microscope(quick, zoom=ZOOM, view_um=VIEW_UM), command(dwell_s)
+    frames = frames_of(path, Bench(microscope=view))
+    light = Lights((GradientLight(), LampDrift(LAMP, period=2.2 * frames)))
+    bench = Bench(microscope=view, methods=METHODS, gain=GAIN, light=light)
+    acquired = acquire(path, bench, counter(frames, advance))
+    angle, rest = view.axis_angle, dwell_s / 4  # the angle is known from the circles
+    turn, calibration = Calibration(1.0, angle), Calibration(view.um_per_px, angle)
     sensors = zeroed(acquired.sensors, rest)
     tracks = {name: zeroed(Motion(m.time_s, turn.to_physical(m.pose)), rest) for name, m in acquired.tracks.items()}
     unknowns = Unknowns(angle=False, lever=True, max_offset_s=0.5)

@@ -20,7 +20,7 @@ from torch_ecc.core.solver import warps
 from torch_ecc.paper import scheme
 from torch_ecc.paper.methods import METHODS, PAPER_ITERATIONS, Follower, prepared
 from torch_ecc.paper.ref34 import Ref34
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
 from torch_ecc.plots.style import letter, new_figure, styled
 from torch_ecc.sim.camera.camera import Camera
 
@@ -55,7 +55,7 @@ class Task(NamedTuple):
     follower: Follower
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Time all methods in turn on one thread. ``quick``: a quarter of the rounds and of the frames."""
     threads, share = torch.get_num_threads(), 4 if quick else 1
     torch.set_num_threads(1)
@@ -70,7 +70,7 @@ def run(quick: bool, advance: Advance) -> Outcome:
         "frame: below zero ref. 34 is slower. (a) here, B-spline iterations; (b) from the paper's Table I."
     )
     picture = Picture("table1", figure, caption)
-    return Outcome("table1", "Table I: time", [picture], [_table(times)], _records(times), _remarks(times))
+    return Experiment("table1", "Table I: time", [picture], [_table(times)], _records(times), _remarks(times))
 
 
 def measure(rounds: int, frames: int, advance: Advance) -> dict[str, Times]:
@@ -215,23 +215,23 @@ def _cross(times: dict[str, Times], name: str) -> str:
     return _beyond(crossover(times[name], times["ref34"]))
 
 
-def _records(times: dict[str, Times]) -> list[Record]:
+def _records(times: dict[str, Times]) -> list[Number]:
     records = []
     for name, t in times.items():
         paper = PAPER.get(name, (None, None))
         records += [
-            Record(f"table1 {name}, t_pre", median(t.precomputation), "ms", paper=paper[0]),
-            Record(f"table1 {name}, t_it, bspline3", median(t.iteration["bspline3"]), "ms", paper=paper[1]),
-            Record(f"table1 {name}, t_it, bilinear", median(t.iteration["bilinear"]), "ms"),
-            Record(f"table1 {name}, whole frame", median(t.frame), "ms"),
-            Record(f"table1 {name}, mean K", t.mean_iterations, "iterations"),
-            Record(f"table1 {name}, per frame by the paper's formula at its mean K", per_frame(times, name), "ms"),
+            Number(f"table1 {name}, t_pre", median(t.precomputation), "ms", paper=paper[0]),
+            Number(f"table1 {name}, t_it, bspline3", median(t.iteration["bspline3"]), "ms", paper=paper[1]),
+            Number(f"table1 {name}, t_it, bilinear", median(t.iteration["bilinear"]), "ms"),
+            Number(f"table1 {name}, whole frame", median(t.frame), "ms"),
+            Number(f"table1 {name}, mean K", t.mean_iterations, "iterations"),
+            Number(f"table1 {name}, per frame by the paper's formula at its mean K", per_frame(times, name), "ms"),
         ]
         if name != "ref34":
             most = float(max(t.iterations))
             paper_K = float(PAPER_CROSSOVER) if name == "gain" else None
             label = f"table1 {name}, K beyond which ref34 is faster (limit: the largest K that occurs)"
-            records.append(Record(label, crossover(t, times["ref34"]), "iterations", "higher", most, paper_K))
+            records.append(Number(label, crossover(t, times["ref34"]), "iterations", "higher", most, paper_K))
     return records
 
 
