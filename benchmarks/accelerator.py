@@ -25,7 +25,7 @@ from torch_ecc.core.align import solve_in_torch
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import stages
-from torch_ecc.paper.accuracy import Harmonic
+from torch_ecc.paper.scheme import Harmonic
 from torch_ecc.sim import Camera, Sequence
 
 FRAME = (480, 640)
@@ -134,7 +134,7 @@ def main(device: str, count: int | None, frames: int, size: int, iterations: int
     """Poses per second, share of the roofline, agreement with the CPU, by sampler."""
     place = torch.device(device)
     count = count or (4096 if place.type == "cuda" else 16)
-    first, *rest = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).path(Camera()), Camera())
+    first, *rest = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).closed(), Camera())
     tracker = Tracker(first, spread(count, size + 40, FRAME).round(), size, device=place)
     images, rate = [view[None].to(place) for view in rest], copy_rate(place)
     console.print(

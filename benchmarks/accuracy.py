@@ -18,7 +18,10 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from torch_ecc.paper.accuracy import Draws, Harmonic, Scatter, by_sampler, least, scatter, track_path, under_light
+from torch_ecc.paper.errors import by_unit, in_degrees, largest, rms
+from torch_ecc.paper.scatter import Draws, Scatter, by_sampler, least, scatter
+from torch_ecc.paper.scheme import Harmonic
+from torch_ecc.paper.sequences import Run, track_path, under_light
 from torch_ecc.sim.camera.camera import Camera
 from torch_ecc.sim.camera.light import GradientLight, SpotLight
 from torch_ecc.sim.camera.sequence import Sequence
@@ -44,8 +47,7 @@ def scatters(draws: int) -> list[Figure]:
         for noise in (0.0, 2.0, 5.0, 10.0):
             for turn in (False, True):
                 s = scatter(scene, Draws(noise, draws, turn, seed=int(noise)))
-                rms = s.error.square().mean(0).sqrt().tolist()
-                cells = [f"{v:.5f}" for v in (rms[0], rms[1], math.degrees(rms[2]))]
+                cells = [f"{v:.5f}" for v in in_degrees(rms(s.error)).tolist()]
                 ratio = " ".join(f"{v:.2f}" for v in s.ratio)
                 title = f"{name}, noise {noise:g}, {MOTIONS[turn]} / worst rms over the bound"
                 figures.append(Figure(title, float(s.ratio.max()), "x", "lower", 0.1))
@@ -91,7 +93,7 @@ def poses(count: int) -> list[Figure]:
                 rows += [(name, motion, *row) for row in _by_error(found, least(scene, draws) if bits else None)]
                 for sampler, s in found.items():
                     title = f"{name}, {motion}, {sampler}{'' if bits else ', unrounded'} / largest error"
-                    px, deg = _pair(s.error.abs().amax(0))
+                    px, deg = by_unit(in_degrees(largest(s.error)))
                     figures.append(Figure(title, px, "px", "lower", 0.1))
                     figures.append(Figure(f"{title}, theta", deg, "deg", "lower", 0.1))
     header = ("scene", "motion", "bits", "sampler", "bad", "largest px", "deg", "rms px", "deg", "off oracle px", "deg")
@@ -103,7 +105,7 @@ def _by_error(found: dict[str, Scatter], best: Tensor | None) -> list[tuple[str,
     """Rows by sampler; where the oracle's errors (draws, 3) are given, these and the Cramer-Rao bound too."""
     rows = []
     for sampler, s in found.items():
-        off = () if best is None else _numbers((s.error - best).abs().amax(0))
+        off = () if best is None else _numbers(largest(s.error - best))
         bad = str(int((s.status != 0).sum()))
         rows.append(("none" if best is None else "8", sampler, bad, *_errors(s.error), *off))
     if best is not None:
@@ -114,17 +116,12 @@ def _by_error(found: dict[str, Scatter], best: Tensor | None) -> list[tuple[str,
 
 def _errors(error: Tensor) -> tuple[str, ...]:
     """Largest and root mean square of (draws, 3)."""
-    return (*_numbers(error.abs().amax(0)), *_numbers(error.square().mean(0).sqrt()))
+    return (*_numbers(largest(error)), *_numbers(rms(error)))
 
 
 def _numbers(error: Tensor) -> tuple[str, ...]:
-    return tuple(f"{v:.5f}" for v in _pair(error))
-
-
-def _pair(error: Tensor) -> tuple[float, float]:
-    """The worse of x and y, px, and theta, deg, of (3,)."""
-    x, y, theta = error.tolist()
-    return max(x, y), math.degrees(theta)
+    """The worse of x and y, px, and theta, deg, of (3,) px, px, rad."""
+    return tuple(f"{v:.5f}" for v in by_unit(in_degrees(error)))
 
 
 def sequences() -> list[Figure]:
@@ -132,7 +129,7 @@ def sequences() -> list[Figure]:
     scene = SCENES["waves"]
     for noise in (0.0, 2.0, 5.0, 10.0):
         camera = Camera(noise_sigma=noise)
-        run = track_path(Sequence(scene, Harmonic().path(camera), camera))
+        run = track_path(Sequence(scene, Harmonic().closed(), camera))
         rows.append(("eq. (11), 20 px, 5 deg", f"{noise:g}", *_cells(run)))
         figures.append(Figure(f"eq. (11), noise {noise:g} / rms", run.rms[0], "px", "lower", 0.1))
     angles = torch.arange(0, 722, 2) * math.pi / 180
@@ -143,7 +140,7 @@ def sequences() -> list[Figure]:
     return figures
 
 
-def _cells(run) -> tuple[str, ...]:
+def _cells(run: Run) -> tuple[str, ...]:
     return (*(f"{v:.5f}" for v in (*run.rms, *run.largest)), str(run.lost))
 
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from trackers import options
 
 from torch_ecc import Tracker
-from torch_ecc.paper.accuracy import SIZE, Harmonic
+from torch_ecc.paper.scheme import SIZE, Harmonic
 from torch_ecc.sim import Camera, Sequence
 
 YARDSTICK = "OpenCV ECC, fastest fair"
@@ -75,7 +75,7 @@ def main(count: int, threads: int, out: Path | None) -> None:
     """Templates per second, time of one iteration of a template, and errors, side by side."""
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
-    sequence = Sequence(SCENE, MOTION.path(Camera()), Camera())
+    sequence = Sequence(SCENE, MOTION.closed(), Camera())
     frames, centers = list(sequence), spread(count, SIZE + ROOM, (480, 640)).round()
     each: dict[str, float] = {}
     follow = {YARDSTICK: loop(frames[0], centers)}

@@ -25,7 +25,7 @@ from rich.table import Table
 from torch import Tensor
 
 from torch_ecc import Tracker
-from torch_ecc.paper.accuracy import Harmonic
+from torch_ecc.paper.scheme import Harmonic
 from torch_ecc.sim import Camera, PlaneWaves
 
 console = Console(width=110)
@@ -41,7 +41,7 @@ FRAME_SIZES = ((240, 320), (480, 640), (960, 1280), (1920, 2560))
 def stack(size: tuple[int, int] = (480, 640), frames: int = FRAMES) -> Tensor:
     """Frames (F, H, W) of small motion with noise of 2 grey levels."""
     camera = Camera(size=size, noise_sigma=2.0)
-    return camera.capture(SCENE, Harmonic(10.0, 2.0, 40).path(camera)[:frames])[:, 0]
+    return camera.capture(SCENE, Harmonic(10.0, 2.0, 40).closed(size)[:frames])[:, 0]
 
 
 def spread(count: int, size: int, frame: tuple[int, int]) -> Tensor:

@@ -43,9 +43,9 @@ def test_every_limit_is_kept(outcomes, name):
 def test_the_joint_estimate_keeps_what_the_nearest_points_absorb(outcomes):
     """Known clock and angle leave no less; tracker, lens and sensors together make up the whole."""
     for r in circles.rounds(True, lambda done, total: None):
-        assert torch.allclose(r.joint.rms, r.known, rtol=0.05)
-        parts = (r.tracker.square() + r.lens.square() + r.cds.square()).sqrt()
-        assert torch.allclose(r.known, parts, rtol=0.1)
+        assert torch.allclose(r.joint.rms, r.parts["known"], rtol=0.05)
+        parts = sum(r.parts[name].square() for name in ("lens", "tracker", "CDS")).sqrt()
+        assert torch.allclose(r.parts["known"], parts, rtol=0.1)
         assert abs(r.joint.offset_s - r.acquired.offset_s) < 4 * r.joint.sigma["offset_s"]
 
 

@@ -9,7 +9,8 @@ import torch
 
 from torch_ecc.core.pose import compose, rotation
 from torch_ecc.paper import fig3, fig4, robustness, scheme, table1, trials
-from torch_ecc.paper.methods import METHODS, errors, largest
+from torch_ecc.paper.errors import box, by_unit, errors, largest
+from torch_ecc.paper.methods import COMPARED, METHODS
 from torch_ecc.paper.result import counter
 from torch_ecc.sim import Camera, PlaneWaves, Sequence
 
@@ -28,7 +29,7 @@ def test_counter_counts_to_its_total():
 
 def test_errors_are_in_px_and_degrees():
     pose = torch.tensor([[1.0, -2.0, math.radians(3)], [0.5, 0.1, 0.0]], dtype=torch.float64)
-    assert largest(errors(pose, torch.zeros_like(pose))) == pytest.approx((2.0, 3.0))
+    assert by_unit(largest(errors(pose, torch.zeros_like(pose)))) == pytest.approx((2.0, 3.0))
 
 
 def test_motion_has_the_papers_amplitudes():
@@ -111,7 +112,7 @@ def test_uneven_light_short(spread):
 def test_even_light_short():
     found = fig3.sequence_errors(scheme.TEXT.path()[38:41], nothing)
     for name, error in found["without UI"].items():
-        px, deg = largest(error)
+        px, deg = by_unit(largest(error))
         assert px < fig3.EVEN_LIMIT[0], name
         assert deg < fig3.EVEN_LIMIT[1], name
 
@@ -129,7 +130,7 @@ def test_ratio_is_one_for_errors_at_the_bound_along_the_templates_axes():
 
 def test_quartiles_are_the_box():
     error = torch.linspace(-3, 1, 401).double()[:, None].expand(-1, 3)
-    assert torch.allclose(fig4.quartiles(error), torch.full((3,), 2.0).double())
+    assert torch.allclose(box(error), torch.full((3,), 2.0).double())
 
 
 def test_noise_short():
@@ -138,7 +139,7 @@ def test_noise_short():
     found = fig4.trials(path, torch.tensor([20, 100]), scheme.cut_reflected(), nothing)
     assert list(found) == ["0.001", "0.002", "0.005"]
     for noisy in found.values():
-        over = {name: noisy.over(name) for name in fig4.USED}
+        over = {name: noisy.over(name) for name in COMPARED}
         assert all(0.6 < value < 1.5 for value in over.values()), over
         assert max(over.values()) - min(over.values()) < 0.1, over
     assert torch.allclose(found["0.002"].bound / found["0.001"].bound, torch.tensor(2.0).sqrt().double(), rtol=2e-3)
@@ -169,12 +170,13 @@ def test_timing_short():
 
 
 def test_pairs_jump_and_turn_as_asked_at_places_that_stay_the_same():
-    near, far = trials.pairs(9, 2.0, 1.0), trials.pairs(9, 30.0, 0.0)
-    assert torch.equal(near.first, far.first)
-    assert torch.allclose((near.truth - trials.MIDDLE)[:, :2].norm(dim=1), torch.tensor(2.0).double())
-    assert torch.allclose(near.truth[:, 2].abs().rad2deg(), torch.tensor(1.0).double())
-    place = compose(trials.MIDDLE * torch.tensor((-1.0, -1.0, 0.0)), near.first)
-    assert torch.allclose(compose(near.truth, place), near.second)
+    (near, second), (far, _) = trials.pairs(9, 2.0, 1.0), trials.pairs(9, 30.0, 0.0)
+    assert torch.equal(near.pose, far.pose)
+    truth = near.truth(second)
+    assert torch.allclose((truth - trials.MIDDLE)[:, :2].norm(dim=1), torch.tensor(2.0).double())
+    assert torch.allclose(truth[:, 2].abs().rad2deg(), torch.tensor(1.0).double())
+    place = compose(trials.MIDDLE * torch.tensor((-1.0, -1.0, 0.0)), near.pose)
+    assert torch.allclose(compose(truth, place), second)
 
 
 def test_corner_error_bounds_what_moves_at_the_corner():
@@ -213,7 +215,7 @@ def test_sweep_short():
     the pyramid reaches farther."""
     changes = [trials.Change(jump=jump, turn=0, size=61) for jump in (0.5, 12, 90)]
     found = trials.sweep(changes, 4, nothing, trackers=True)
-    for name in (*trials.METHODS_USED, *trials.TRACKERS):
+    for name in (*COMPARED, *trials.TRACKERS):
         assert found.rate[name][0] == 1, name
         assert found.rate[name][2] == ("search" in name), name
         assert found.error[name][0] < 0.05, name

@@ -12,7 +12,6 @@ from torch_ecc.core.pose import inverse, transform
 from torch_ecc.sim.camera.sensor import WHITE
 from torch_ecc.sim.scene.scene import Scene
 
-QUANTISATION = 1 / 12  # variance of rounding to whole grey levels
 NUDGE = 1 / 64  # px: half the base of the difference quotients below
 SETTLED = 1e-6  # px: the last step of an oracle that has its answer
 STEPS = 30  # at most; it takes two or three from nearby
@@ -46,7 +45,7 @@ def cramer_rao(scene: AnalyticScene, size: tuple[int, int], variance: float) -> 
 
 def rounding(bits: int | None) -> float:
     """Variance of rounding to ``bits``, squared grey levels of 0..255; of None, no rounding, zero."""
-    return 0.0 if bits is None else QUANTISATION * (WHITE / (2**bits - 1)) ** 2
+    return 0.0 if bits is None else (WHITE / (2**bits - 1)) ** 2 / 12
 
 
 def oracle(scene: Scene, frame: Tensor, start: Tensor, size: tuple[int, int]) -> Tensor:

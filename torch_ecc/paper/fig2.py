@@ -51,7 +51,7 @@ def run(quick: bool, advance: Advance) -> Experiment:
     return Experiment("fig2", "Fig. 2: how the sequences are made", [picture], [table], records, REMARKS)
 
 
-def _words(motion: scheme.Motion) -> str:
+def _words(motion: scheme.Harmonic) -> str:
     where = "text" if motion == scheme.TEXT else "caption of Fig. 2"
     return f"{motion.amplitude:g} px, {motion.amplitude:g} px, {motion.degrees:g} deg ({where})"
 

@@ -27,47 +27,55 @@ SURROUND = 150.0  # px, Gaussian of the Retinex surround: wider than any block o
 
 
 @dataclass(frozen=True)
-class Motion:
+class Harmonic:
     """Eq. (11): ``amplitude`` px in x and y and ``degrees`` in theta, ``points`` in a cycle."""
 
-    amplitude: float
-    degrees: float
-    points: int
+    amplitude: float = 20.0
+    degrees: float = 5.0
+    points: int = 40
 
-    def path(self) -> Tensor:
-        """Poses (points, 3) px, px, rad of the scene about the middle of the frame."""
+    def path(self, size: tuple[int, int] = FRAME) -> Tensor:
+        """Poses (points, 3) px, px, rad of the scene about the middle of a frame (h, w)."""
         turn = math.radians(self.degrees)
-        return placed(harmonic((self.amplitude, self.amplitude, turn), self.points), CENTRE)
+        return placed(harmonic((self.amplitude, self.amplitude, turn), self.points), (size[1] / 2, size[0] / 2))
+
+    def closed(self, size: tuple[int, int] = FRAME) -> Tensor:
+        """The same (points + 1, 3), begun with the pose that they end with."""
+        path = self.path(size)
+        return torch.cat((path[-1:], path))
 
     def __str__(self) -> str:
         return f"{self.amplitude:g} px, {self.degrees:g} deg, Nop {self.points}"
 
 
-TEXT = Motion(100.0, 20.0, 160)  # as the text has it
-CAPTION = Motion(100.0, 12.0, 200)  # as the caption of Fig. 2 has it
+TEXT = Harmonic(100.0, 20.0, 160)  # as the text has it
+CAPTION = Harmonic(100.0, 12.0, 200)  # as the caption of Fig. 2 has it
 
 
 class Cut(NamedTuple):
-    """Where templates are cut: ``pose`` (3,) of the scene in the image they are cut from, and their own ``start``
-    (3,) in that image, upright and on whole pixels."""
+    """Where templates are cut: ``pose`` (3,), of many images (F, 3), of the scene in the image they are cut from, and
+    their own ``start`` (3,) in that image, upright and on whole pixels."""
 
     pose: Tensor
     start: Tensor
 
     def truth(self, path: Tensor) -> Tensor:
         """Exact poses (F, 3) of the template when the scene moves along ``path`` (F, 3)."""
-        own = compose(inverse(self.pose), self.start)
-        return compose(path, own.expand_as(path))
+        return compose(path, self._own().expand_as(path))
 
     def seen(self, scene: Scene) -> Turned:
         """``scene`` in the template's own coordinates."""
-        return Turned(scene, compose(inverse(self.pose), self.start))
+        return Turned(scene, self._own())
 
     def template(self, image: Tensor, size: int = SIZE) -> Tensor:
         """The template (..., size + 2 MARGIN, size + 2 MARGIN) of images (..., h, w), with its surroundings."""
         reach = size // 2 + MARGIN
         x, y = self.start[:2].long().tolist()
         return image[..., y - reach : y + reach + size % 2, x - reach : x + reach + size % 2]
+
+    def _own(self) -> Tensor:
+        """Poses of the template in the scene."""
+        return compose(inverse(self.pose), self.start.expand_as(self.pose))
 
 
 def cut_first(path: Tensor) -> Cut:

@@ -7,21 +7,17 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from statistics import median, quantiles
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ecc.core.pose import retract
-from torch_ecc.core.reference import Reference
-from torch_ecc.core.sampling import Sampler, make_sampler
-from torch_ecc.core.solver import warps
+from torch_ecc.core.sampling import Sampler
 from torch_ecc.paper import scheme
-from torch_ecc.paper.methods import METHODS, PAPER_ITERATIONS, Follower, prepared
-from torch_ecc.paper.ref34 import Ref34
+from torch_ecc.paper.methods import METHODS, PAPER_ITERATIONS, Follower
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
-from torch_ecc.plots.style import letter, new_figure, styled
+from torch_ecc.plots.style import letter, new_figure
 from torch_ecc.sim.camera.camera import Camera
 
 ROUNDS, ITERATIONS = 120, 10  # rounds of all methods in turn; iterations timed at once
@@ -63,13 +59,11 @@ def run(quick: bool, advance: Advance) -> Experiment:
         times = measure(ROUNDS // share, FRAMES // share, advance)
     finally:
         torch.set_num_threads(threads)
-    with styled():
-        figure = draw(times)
     caption = (
         "Time per frame over the number of iterations K, less that of ref. 34, which pays its precomputation at every "
         "frame: below zero ref. 34 is slower. (a) here, B-spline iterations; (b) from the paper's Table I."
     )
-    picture = Picture("table1", figure, caption)
+    picture = Picture("table1", draw(times), caption)
     return Experiment("table1", "Table I: time", [picture], [_table(times)], _records(times), _remarks(times))
 
 
@@ -102,35 +96,19 @@ def measure(rounds: int, frames: int, advance: Advance) -> dict[str, Times]:
 def _task(name: str, template: Tensor, start: Tensor, image: Tensor) -> Task:
     """One template (1, 1, ...), the frame (1, 1, H, W) after the one that it is at ``start`` (1, 3) in."""
     follower = METHODS[name].start(template, start)
-    precompute: Callable[[], object]
-    if isinstance(follower, Ref34):
-        precompute, solve = follower.precompute, follower.precompute()
-        samplers = {s: follower.sampler(image.float(), s) for s in SAMPLERS}
-        loop: Callable[[Sampler], None] = partial(_loop_ref34, follower, start, solve)
-    else:
-        reference = follower.reference
-        precompute = partial(prepared, template, METHODS[name].options or {})
-        samplers = {s: make_sampler(s, image.float(), warps(reference, start), reference.box) for s in SAMPLERS}
-        loop = partial(_loop, reference, start)
+    constants: Any = follower.precompute()
+    samplers = {s: follower.sampler(image.float(), s) for s in SAMPLERS}
+
+    def loop(sample: Sampler) -> None:
+        follower.pose = start
+        for _ in range(ITERATIONS):
+            follower.iterate(sample, constants)
 
     def frame() -> None:
         follower.pose = start
         follower.track(image)
 
-    return Task(precompute, {s: partial(loop, samplers[s]) for s in SAMPLERS}, frame, follower)
-
-
-def _loop(reference: Reference, pose: Tensor, sample: Sampler) -> None:
-    """The bare iterations of Algorithm 1, lines 8 and 9: sample, step, update."""
-    for _ in range(ITERATIONS):
-        g = sample(warps(reference, pose), reference.pixels)
-        pose = retract(pose, reference.criterion.step(reference, g).to(pose.dtype))
-
-
-def _loop_ref34(follower: Ref34, pose: Tensor, solve: Tensor, sample: Sampler) -> None:
-    follower.pose = pose
-    for _ in range(ITERATIONS):
-        follower.iterate(sample, solve)
+    return Task(follower.precompute, {s: partial(loop, samplers[s]) for s in SAMPLERS}, frame, follower)
 
 
 def _ms(work: Callable[[], object]) -> float:
