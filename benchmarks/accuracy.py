@@ -13,12 +13,13 @@ from pathlib import Path
 
 import click
 import torch
-from results import Figure, save
+from results import save
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
 from torch_ecc.paper.errors import by_unit, in_degrees, largest, rms
+from torch_ecc.paper.result import Number
 from torch_ecc.paper.scatter import Draws, Scatter, by_sampler, least, scatter
 from torch_ecc.paper.scheme import Harmonic
 from torch_ecc.paper.sequences import Run, track_path, under_light
@@ -41,7 +42,7 @@ def show(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> No
     console.print(table)
 
 
-def scatters(draws: int) -> list[Figure]:
+def scatters(draws: int) -> list[Number]:
     rows, figures = [], []
     for name, scene in SCENES.items():
         for noise in (0.0, 2.0, 5.0, 10.0):
@@ -50,7 +51,7 @@ def scatters(draws: int) -> list[Figure]:
                 cells = [f"{v:.5f}" for v in in_degrees(rms(s.error)).tolist()]
                 ratio = " ".join(f"{v:.2f}" for v in s.ratio)
                 title = f"{name}, noise {noise:g}, {MOTIONS[turn]} / worst rms over the bound"
-                figures.append(Figure(title, float(s.ratio.max()), "x", "lower", 0.1))
+                figures.append(Number(title, float(s.ratio.max()), "x", "lower", 0.1))
                 mean = f"{float(s.nees.mean()):.2f}"
                 iterations = f"{float(s.iterations.double().mean()):.1f}"
                 rows.append(
@@ -81,7 +82,7 @@ def scatters(draws: int) -> list[Figure]:
     return figures
 
 
-def poses(count: int) -> list[Figure]:
+def poses(count: int) -> list[Number]:
     """Errors without noise, start 0.3 px and 0.17 deg off, by sampler; unrounded, and in 8 bit beside those of an
     oracle: the scene itself fitted to the same frames by least squares."""
     rows, figures = [], []
@@ -94,8 +95,8 @@ def poses(count: int) -> list[Figure]:
                 for sampler, s in found.items():
                     title = f"{name}, {motion}, {sampler}{'' if bits else ', unrounded'} / largest error"
                     px, deg = by_unit(in_degrees(largest(s.error)))
-                    figures.append(Figure(title, px, "px", "lower", 0.1))
-                    figures.append(Figure(f"{title}, theta", deg, "deg", "lower", 0.1))
+                    figures.append(Number(title, px, "px", "lower", 0.1))
+                    figures.append(Number(f"{title}, theta", deg, "deg", "lower", 0.1))
     header = ("scene", "motion", "bits", "sampler", "bad", "largest px", "deg", "rms px", "deg", "off oracle px", "deg")
     show(f"{count} random poses, no noise; bad: not converged; off oracle: largest difference", header, rows)
     return figures
@@ -124,14 +125,14 @@ def _numbers(error: Tensor) -> tuple[str, ...]:
     return tuple(f"{v:.5f}" for v in by_unit(in_degrees(error)))
 
 
-def sequences() -> list[Figure]:
+def sequences() -> list[Number]:
     rows, figures = [], []
     scene = SCENES["waves"]
     for noise in (0.0, 2.0, 5.0, 10.0):
         camera = Camera(noise_sigma=noise)
         run = track_path(Sequence(scene, Harmonic().closed(), camera))
         rows.append(("eq. (11), 20 px, 5 deg", f"{noise:g}", *_cells(run)))
-        figures.append(Figure(f"eq. (11), noise {noise:g} / rms", run.rms[0], "px", "lower", 0.1))
+        figures.append(Number(f"eq. (11), noise {noise:g} / rms", run.rms[0], "px", "lower", 0.1))
     angles = torch.arange(0, 722, 2) * math.pi / 180
     camera = Camera(size=(221, 221))
     path = torch.stack((110 + 0 * angles, 110 + 0 * angles, angles), -1).double()
@@ -144,14 +145,14 @@ def _cells(run: Run) -> tuple[str, ...]:
     return (*(f"{v:.5f}" for v in (*run.rms, *run.largest)), str(run.lost))
 
 
-def lights() -> list[Figure]:
+def lights() -> list[Number]:
     rows, figures = [], []
     for light in (None, GradientLight(scale_px=640), SpotLight(scale_px=640)):
         for name, scene in SCENES.items():
             for method, run in under_light(scene, light, Harmonic(50.0, 10.0, 60)).items():
                 kind = type(light).__name__ if light else "even"
                 rows.append((kind, name, method, *_cells(run)))
-                figures.append(Figure(f"{kind}, {name}, {method} / largest", run.largest[0], "px", "lower", 0.1))
+                figures.append(Number(f"{kind}, {name}, {method} / largest", run.largest[0], "px", "lower", 0.1))
     header = ("light", "scene", "method", "rms px", "rms deg", "largest px", "largest deg", "lost")
     show("Uneven light, no noise, eq. (11) with 50 px and 10 deg", header, rows)
 
@@ -166,7 +167,7 @@ def lights() -> list[Figure]:
 def main(draws: int, count: int, only: tuple[str, ...], out: Path | None) -> None:
     """Print what the README quotes."""
     torch.set_num_threads(1)
-    sections: dict[str, Callable[[], list[Figure]]] = {
+    sections: dict[str, Callable[[], list[Number]]] = {
         "scatters": lambda: scatters(draws),
         "poses": lambda: poses(count),
         "sequences": sequences,

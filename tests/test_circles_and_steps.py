@@ -148,7 +148,7 @@ def test_an_acquisition_says_what_is_lost_and_where_zero_is():
     path[:, 0] = 2 * ease(torch.linspace(-1, 1.5, 700))
     got = acquire(path, Bench(microscope=Microscope(region_px=(200, 220), exposure_s=0.0)), lambda: None)
     frames = len(got.truth.time_s)
-    assert frames == got.tracks["ECC"].pose.shape[0] == got.sigma["ECC"].shape[0]
+    assert frames == got.tracks["ECC"].pose.shape[0]
     error = (got.tracks["ECC"].pose - got.truth.pose)[:, :2].abs()
     assert error.max() < 5e-3  # um
     assert set(got.seconds) == {"stage", "sensors", "frames", "tracking, ECC"}

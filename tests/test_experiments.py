@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 
-from torch_ecc.core.pose import compose, rotation
+from torch_ecc.core.pose import compose, rotation, transform
 from torch_ecc.paper import fig3, fig4, robustness, scheme, table1, trials
+from torch_ecc.paper.bound import cramer_rao
 from torch_ecc.paper.errors import box, by_unit, errors, largest
 from torch_ecc.paper.methods import COMPARED, METHODS
 from torch_ecc.paper.result import counter
@@ -60,18 +61,16 @@ def test_template_is_cut_around_its_start(size):
     assert (centre - cut.start[:2]).abs().max() <= (0.5 if size % 2 == 0 else 0)
 
 
-def test_a_scene_in_the_templates_own_coordinates():
-    """The same grey levels at the same places, and a gradient along the template's axes."""
+def test_the_bound_of_a_template_that_lies_turned_is_along_its_own_axes():
+    """Of gradients by autodiff of the scene as the template sees it."""
     scene, path = PlaneWaves.random(seed=3), scheme.TEXT.path()[7:8]
-    cut = scheme.cut_first(path)
-    turned = cut.seen(scene)
-    points = torch.tensor([[3.0, -2.0], [-7.5, 11.25]], dtype=torch.float64)
-    frame = scene.render(path, scheme.FRAME)[0, 0]
-    at = (cut.start[:2] + points[:1]).long()[0]
-    assert abs(float(turned.value(points)[0]) - float(frame[at[1], at[0]])) < 1e-2
-    step = 1e-3 * torch.eye(2, dtype=torch.float64)
-    slopes = torch.stack([(turned.value(points + d) - turned.value(points - d)) / 2e-3 for d in step], -1)
-    assert torch.allclose(turned.gradient(points), slopes, atol=1e-4)
+    own = scheme.cut_first(path).own()
+    y, x = torch.meshgrid(*(torch.arange(21) - 10.0,) * 2, indexing="ij")
+    points = torch.stack((x.flatten(), y.flatten()), -1).double()
+    moved = torch.func.jacfwd(lambda p: scene.value(transform(own, transform(p, points))))(torch.zeros(3).double())
+    seen = torch.stack((torch.ones(len(points)).double(), scene.value(transform(own, points))), 1)
+    J = moved - seen @ torch.linalg.lstsq(seen, moved).solution
+    assert torch.allclose(cramer_rao(scene, (21, 21), 4.0, own), 2 * torch.linalg.inv(J.mT @ J).diagonal().sqrt())
 
 
 def test_a_scene_kept_is_the_scene_rendered():
@@ -146,7 +145,7 @@ def test_noise_short():
 
 
 def times(once: float, each: float) -> table1.Times:
-    return table1.Times([once] * 4, {name: [each] * 4 for name in table1.SAMPLERS}, [1.0] * 4, [4, 6])
+    return table1.Times({table1.T_PRE: [once] * 4, table1.T_IT: [each] * 4}, [4, 6])
 
 
 def test_crossover_is_where_both_formulas_meet():
@@ -164,8 +163,9 @@ def test_timing_short():
     found = table1.measure(2, 2, lambda done, total: None)
     assert list(found) == list(METHODS)
     for name, t in found.items():
-        assert len(t.precomputation) == len(t.frame) == len(t.iterations) == 2
-        assert min(*t.precomputation, *t.frame, *t.iteration["bspline3"]) > 0, name
+        assert list(t.ms) == list(table1.WORKS)
+        assert {len(t.iterations), *map(len, t.ms.values())} == {2}
+        assert min(map(min, t.ms.values())) > 0, name
         assert 1 < max(t.iterations) <= 15, name
 
 

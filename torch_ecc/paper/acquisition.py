@@ -17,14 +17,9 @@ from torch_ecc.core.estimate import Estimate, Status, Track
 from torch_ecc.paper.result import Advance, Table, cells
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Motion
+from torch_ecc.sim import Floor, Microscope, Sensors, Sequence, Stage, StageMotion, StageSettings, micrograph
 from torch_ecc.sim.camera.light import Light
-from torch_ecc.sim.camera.sequence import Sequence
-from torch_ecc.sim.scene.micrograph import micrograph
 from torch_ecc.sim.scene.window import Window
-from torch_ecc.sim.stage.microscope import Microscope
-from torch_ecc.sim.stage.sensors import Sensors
-from torch_ecc.sim.stage.stage import Stage, StageMotion, StageSettings
-from torch_ecc.sim.stage.vibration import Floor
 from torch_ecc.track.tracker import Tracker
 
 SIZE = 121  # px, the paper's template
@@ -53,14 +48,12 @@ class Bench:
 class Acquisition(NamedTuple):
     """Both records as ``Motion`` in um, um, rad: one per tracker, NaN where it was lost, and the sensors'.
 
-    Each counts from its own zero; ``zeroed`` brings them to zero at rest. ``sigma`` (F, 3) um, um, rad as each tracker
-    gives it; ``truth`` is what the template's image really did, through the same calibration, ``motion`` what the stage
-    really did, on the sensors' clock, and ``offset_s`` the truth of the clocks. ``seconds`` each part took; ``first``
-    (H, W) is the first frame.
+    Each counts from its own zero; ``zeroed`` brings them to zero at rest. ``truth`` is what the template's image really
+    did, through the same calibration, ``motion`` what the stage really did, on the sensors' clock, and ``offset_s`` the
+    truth of the clocks. ``seconds`` each part took; ``first`` (H, W) is the first frame.
     """
 
     tracks: dict[str, Motion]
-    sigma: dict[str, Tensor]
     sensors: Motion
     truth: Motion
     motion: StageMotion
@@ -89,12 +82,11 @@ def acquire(command: Tensor, bench: Bench, tick: Callable[[], None]) -> Acquisit
     center = torch.tensor([_middle(film.camera.size)])
     truth = scale.to_physical(film.truth(center)[:, 0] - film.truth(center)[0, 0])
     offset = float(bench.microscope.times(motion, start_s=CAMERA_START_S)[0] - record.times_s[0])
-    motions, sigma = {}, {}
+    motions = {}
     for name, track in tracks.items():
         pose = scale.to_physical(track.displacement[:, 0])
         motions[name] = Motion(times, torch.where(Status.good(track.status), pose, torch.nan))
-        sigma[name] = scale.covariance(track.covariance[:, 0]).diagonal(dim1=-2, dim2=-1).sqrt()
-    return Acquisition(motions, sigma, read, Motion(times, truth), motion, offset, seconds, first)
+    return Acquisition(motions, read, Motion(times, truth), motion, offset, seconds, first)
 
 
 def acquired_once(simulate: Callable[[bool, Advance], T]) -> Callable[[bool, Advance], T]:

@@ -14,7 +14,7 @@ from torch_ecc.paper import scheme
 from torch_ecc.paper.drawing import own_scale
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
 from torch_ecc.plots.style import COMPONENTS, letter, new_figure
-from torch_ecc.sim.scene.retinex import Retinex
+from torch_ecc.sim import Retinex
 
 COLOURS = ("#0072b2", "#d55e00")
 LINES = (("-", "#1b1b1b"), ("--", "#8a8a8a"))  # of the two motions

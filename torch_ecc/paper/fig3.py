@@ -16,7 +16,7 @@ from torch_ecc.paper.errors import by_unit, errors, largest
 from torch_ecc.paper.methods import METHODS, Follower
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells, counter
 from torch_ecc.plots.style import COMPONENTS, UNITS, letter, new_figure
-from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.sim import Camera
 
 PAPER = {"gain": (0.05, 0.05), "ref34": (0.07, 0.35)}  # px, deg: the paper's largest errors with UI
 EVEN_LIMIT = (0.005, 0.005)  # px, deg, of every ecc without UI

@@ -18,8 +18,7 @@ from torch_ecc.paper.errors import box, by_unit, errors, in_degrees, largest, rm
 from torch_ecc.paper.methods import COMPARED, METHODS, Follower
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells, counter
 from torch_ecc.plots.style import COMPONENTS, UNITS, letter, new_figure
-from torch_ecc.sim.camera.camera import Camera
-from torch_ecc.sim.camera.sensor import noise_sigma
+from torch_ecc.sim import Camera, noise_sigma
 
 VARIANCES = (0.001, 0.002, 0.005)  # of the noise on the [0, 1] scale
 DRAWS = 4  # fresh noise at every pose
@@ -110,7 +109,7 @@ def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None
     noisy = bool((cut.pose == path[0]).all())
     still = scheme.Kept(scene, scene.render(cut.pose[None], scheme.FRAME))
     many = torch.zeros(DRAWS, dtype=torch.long)
-    bound = in_degrees(cramer_rao(cut.seen(scene), (scheme.SIZE, scheme.SIZE), 2.0 if noisy else 1.0))
+    bound = in_degrees(cramer_rao(scene, (scheme.SIZE, scheme.SIZE), 2.0 if noisy else 1.0, cut.own()))
     cameras = {v: Camera(size=scheme.FRAME, noise_sigma=noise_sigma(v)) for v in VARIANCES}
     found: dict[float, dict[str, list[Tensor]]] = {v: {m: [] for m in COMPARED} for v in VARIANCES}
     followers: dict[str, Follower] = {}

@@ -9,18 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from torch_ecc.paper import parasitic
 from torch_ecc.paper.errors import rms
-from torch_ecc.paper.parasitic import (
-    Deviations,
-    aliased,
-    deviations,
-    lever_arm,
-    other_sensors,
-    predicted,
-    scattered,
-    sensed,
-    true_deviations,
-)
+from torch_ecc.paper.parasitic import Deviations
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
 from torch_ecc.paper.steps import VIEW_UM, Staircase, staircase
 from torch_ecc.plots.style import COMPONENTS, letter, new_figure
@@ -42,15 +33,15 @@ REMARKS = (
 def run(quick: bool, advance: Advance) -> Experiment:
     """x and y of ECC while theta steps, drawn as the paper's Fig. 9. ``quick``: dwells of 0.3 s."""
     found = staircase(quick, advance)
-    by_sensors, by_truth = deviations(found), true_deviations(found)
+    by_sensors, by_truth = parasitic.deviations(found), parasitic.true_deviations(found)
     caption = (
         "Translation of ECC during the angular trajectory. (a) in the plane, ascent and descent; (b) its components "
         "over time. Black and grey: lever arm times the sensors' angle, which rings after each step. "
         "(c) means of the steps minus lever arm times angle, with their standard deviations."
     )
-    lever, spread = lever_arm(found, by_sensors.covariance)
+    lever, spread = parasitic.lever_arm(found, by_sensors.covariance)
     share = float(((lever - lever.new_tensor(VIEW_UM)).abs() / spread).max())
-    others = torch.stack([some.nm / some.sigma for some in other_sensors(found, SETS)])
+    others = torch.stack([some.nm / some.sigma for some in parasitic.other_sensors(found, SETS)])
     records = [
         Number("fig9 lever arm from the steps: error over its sigma", share, "", tolerance=3.0),
         Number("fig9 steps: rms deviation from lever arm times angle", by_sensors.rms, "nm"),
@@ -87,9 +78,9 @@ def _budget(found: Staircase) -> Table:
     """What sigma is made of."""
     cds = found.dwells["CDS"].mean[1:]
     causes = {
-        "scatter of the frames": scattered(found)[1:] + scattered(found)[0],
-        "sampler's aliasing": aliased(found)[1:].diagonal(dim1=1, dim2=2),
-        "sensors' non-linearity": sensed(cds).diagonal().reshape(-1, 2),
+        "scatter of the frames": parasitic.scattered(found)[1:] + parasitic.scattered(found)[0],
+        "sampler's aliasing": parasitic.aliased(found)[1:].diagonal(dim1=1, dim2=2),
+        "sensors' non-linearity": parasitic.sensed(cds).diagonal().reshape(-1, 2),
     }
     top = int(cds[:, 2].argmax())
     rows = [(name, *cells(variance[top].sqrt(), ".2f")) for name, variance in causes.items()]
@@ -104,7 +95,7 @@ def draw(found: Staircase, by_sensors: Deviations, by_truth: Deviations) -> Figu
     time = track.time_s + found.alignment.offset_s
     top = int(found.levels_deg.argmax())
     turning = float(found.windows_s[top].mean())
-    law = predicted(sensors.pose)
+    law = parasitic.predicted(sensors.pose)
     for rows, colour, words in ((time < turning, UP, "ascent"), (time >= turning, DOWN, "descent")):
         plane.plot(*track.pose[rows, :2].T, ".", ms=2, color=colour, label=words)
     plane.plot(*law[::16].T, color=LAW, lw=0.8, label=r"lever arm x $\theta$ of CDS")

@@ -18,7 +18,7 @@ from torch_ecc.paper.acquisition import tracker_of
 from torch_ecc.paper.errors import rms
 from torch_ecc.paper.steps import VIEW_UM, Staircase
 from torch_ecc.records.motion import Motion, dwell_errors
-from torch_ecc.sim.stage.sensors import Sensors, SensorSettings, nonlinear_modes
+from torch_ecc.sim import Sensors, SensorSettings, nonlinear_modes
 
 
 class Deviations(NamedTuple):

@@ -10,26 +10,13 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from torch_ecc.paper import trials
 from torch_ecc.paper.methods import METHODS
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells, counter
 from torch_ecc.paper.scheme import SIZE
-from torch_ecc.paper.trials import (
-    FOUND,
-    FRAME,
-    JUMP,
-    MIDDLE,
-    NOISE,
-    SEED,
-    TURN,
-    UNNOTICED,
-    Change,
-    Found,
-    camera,
-    sampler_errors,
-    sweep,
-)
+from torch_ecc.paper.trials import FOUND, JUMP, NOISE, TURN, UNNOTICED, Change, Found, camera
 from torch_ecc.plots.style import letter, new_figure
-from torch_ecc.sim.camera.occluder import Occluder
+from torch_ecc.sim import Occluder
 
 COUNT = 48  # templates
 SAMPLERS = ("bilinear", "bspline3", "bspline5")
@@ -65,8 +52,8 @@ class Panel(NamedTuple):
 
 def covered(share: float) -> Change:
     """Something dark in front of the camera covers that share of the template from one side, up to the jump."""
-    right = float(MIDDLE[0]) - SIZE / 2 + share * SIZE
-    occluder = Occluder(center=(right / 2 - 50, FRAME[0] / 2), half_size=(right / 2 + 50, FRAME[0]))
+    right = float(trials.MIDDLE[0]) - SIZE / 2 + share * SIZE
+    occluder = Occluder(center=(right / 2 - 50, trials.FRAME[0] / 2), half_size=(right / 2 + 50, trials.FRAME[0]))
     return Change(camera=camera(occluders=(occluder,) if share else ()))
 
 
@@ -115,10 +102,9 @@ def run(quick: bool, advance: Advance) -> Experiment:
     count, step = (COUNT // 6, 2) if quick else (COUNT, 1)
     sweeps = {name: s._replace(levels=s.levels[::step]) for name, s in (BASIN | SWEEPS).items()}
     tick = counter(sum(len(s.levels) for s in sweeps.values()) + 2, advance)
-    found = {
-        name: sweep([s.change(v) for v in s.levels], count, tick, trackers=name in BASIN) for name, s in sweeps.items()
-    }
-    errors = {noise: sampler_errors(noise, count, SAMPLERS, tick) for noise in (0.0, NOISE)}
+    changes = {name: [s.change(v) for v in s.levels] for name, s in sweeps.items()}
+    found = {name: trials.sweep(c, count, tick, trackers=name in BASIN) for name, c in changes.items()}
+    errors = {noise: trials.sampler_errors(noise, count, SAMPLERS, tick) for noise in (0.0, NOISE)}
     pictures = [_basin(sweeps, found), *(_picture(name, sweeps[name], found[name]) for name in SWEEPS)]
     pictures.append(_samplers(errors))
     tables = [_table(sweeps, found, count), _sampler_table(errors)]
@@ -128,7 +114,7 @@ def run(quick: bool, advance: Advance) -> Experiment:
         for m, limit in limits(sweeps[name], found[name]).items()
         for better in ["lower" if name in ("contrast", "size") else "higher"]
     ]
-    return Experiment("robustness", "Robustness beyond the paper", pictures, tables, records, REMARKS, SEED)
+    return Experiment("robustness", "Robustness beyond the paper", pictures, tables, records, REMARKS, trials.SEED)
 
 
 def limits(swept: Sweep, found: Found) -> dict[str, float]:

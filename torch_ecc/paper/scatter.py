@@ -17,8 +17,7 @@ from torch_ecc.paper.bound import cramer_rao, oracle, rounding
 from torch_ecc.paper.errors import rms
 from torch_ecc.paper.methods import prepared
 from torch_ecc.paper.scheme import SIZE, Cut
-from torch_ecc.sim.camera.camera import Camera
-from torch_ecc.sim.scene.scene import Scene
+from torch_ecc.sim import Camera, Scene
 
 BATCH = 50  # pairs that are aligned at once
 ROOM = 40  # px that a frame is larger than the template and its surroundings, on each side

@@ -9,14 +9,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.core.pose import compose, inverse, rotation, transform
+from torch_ecc.core.pose import compose, inverse
 from torch_ecc.core.reference import MARGIN
-from torch_ecc.sim.camera.camera import Camera
-from torch_ecc.sim.camera.light import FieldLight, GradientLight, Lights, VignetteLight
-from torch_ecc.sim.camera.motion import harmonic, placed
-from torch_ecc.sim.scene.micrograph import micrograph
-from torch_ecc.sim.scene.retinex import Retinex, single_scale
-from torch_ecc.sim.scene.scene import Scene
+from torch_ecc.sim import (
+    Camera,
+    FieldLight,
+    GradientLight,
+    Lights,
+    Retinex,
+    Scene,
+    VignetteLight,
+    harmonic,
+    micrograph,
+    placed,
+    single_scale,
+)
 
 SIZE = 121  # px, side of the paper's template
 FRAME = (480, 640)  # (h, w) px
@@ -61,21 +68,17 @@ class Cut(NamedTuple):
 
     def truth(self, path: Tensor) -> Tensor:
         """Exact poses (F, 3) of the template when the scene moves along ``path`` (F, 3)."""
-        return compose(path, self._own().expand_as(path))
+        return compose(path, self.own().expand_as(path))
 
-    def seen(self, scene: Scene) -> Turned:
-        """``scene`` in the template's own coordinates."""
-        return Turned(scene, self._own())
+    def own(self) -> Tensor:
+        """Poses of the templates in the scene, as those of the cut."""
+        return compose(inverse(self.pose), self.start.expand_as(self.pose))
 
     def template(self, image: Tensor, size: int = SIZE) -> Tensor:
         """The template (..., size + 2 MARGIN, size + 2 MARGIN) of images (..., h, w), with its surroundings."""
         reach = size // 2 + MARGIN
         x, y = self.start[:2].long().tolist()
         return image[..., y - reach : y + reach + size % 2, x - reach : x + reach + size % 2]
-
-    def _own(self) -> Tensor:
-        """Poses of the template in the scene."""
-        return compose(inverse(self.pose), self.start.expand_as(self.pose))
 
 
 def cut_first(path: Tensor) -> Cut:
@@ -107,22 +110,6 @@ def components() -> Retinex:
 def uneven_light() -> FieldLight:
     """The incident component of the original as the light of a sequence: it stays with the camera."""
     return FieldLight(components().incident[0, 0])
-
-
-@dataclass(frozen=True, eq=False)
-class Turned:
-    """A scene in the coordinates of something that lies in it at ``pose`` (3,); for the Cramer-Rao bound."""
-
-    scene: Scene
-    pose: Tensor
-
-    def value(self, points: Tensor) -> Tensor:
-        """(..., 2) -> (...)."""
-        return self.scene.value(transform(self.pose, points))
-
-    def gradient(self, points: Tensor) -> Tensor:
-        """(..., 2) -> (..., 2): along the own axes."""
-        return self.scene.gradient(transform(self.pose, points)) @ rotation(self.pose[2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,8 @@ from torch import Tensor
 from torch_ecc.core.estimate import Status
 from torch_ecc.paper.errors import by_unit, errors, largest, rms
 from torch_ecc.paper.scheme import SIZE, Harmonic
-from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.sim import Camera, Scene, Sequence
 from torch_ecc.sim.camera.light import Light
-from torch_ecc.sim.camera.sequence import Sequence
-from torch_ecc.sim.scene.scene import Scene
 from torch_ecc.track.tracker import Tracker
 
 

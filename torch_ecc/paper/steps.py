@@ -25,7 +25,7 @@ from torch_ecc.paper.result import Advance, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Dwells, Motion, dwell_errors
 from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
-from torch_ecc.sim.camera.light import GradientLight, LampDrift, Lights
+from torch_ecc.sim import GradientLight, LampDrift, Lights
 
 STEP_DEG, HIGHEST = 0.04, 6
 LEVELS = (*range(HIGHEST + 1), *range(HIGHEST - 1, -1, -1))  # in steps

@@ -16,7 +16,7 @@ from torch_ecc.core.pose import compose
 from torch_ecc.paper.errors import errors
 from torch_ecc.paper.methods import COMPARED, METHODS, Aligned, Follower
 from torch_ecc.paper.scheme import SIZE, Cut, Kept, scene
-from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.sim import Camera
 from torch_ecc.track.tracker import AT_ONCE, Tracker
 
 FRAME = (320, 320)  # (h, w) px
