@@ -123,7 +123,7 @@ def test_portions_of_a_made_up_record():
     c, s = math.cos(0.01), math.sin(0.01)
     turned[:, 0], turned[:, 1] = c * path[:, 0] - s * path[:, 1], s * path[:, 0] + c * path[:, 1]
     assert circles.line_angle(Motion(t, turned), sensors) == pytest.approx(0.01, abs=1e-9)
-    rim = circles.circular(sensors)
+    rim = circles.portions(sensors)[1]
     assert path[rim, :2].norm(dim=1).min() > 8.9
     assert not rim[0]
     assert not rim[-1]

@@ -37,7 +37,7 @@ T = TypeVar("T")
 class Bench:
     """Settings: microscope, light, ``gain`` and ``noise`` of the camera in grey levels, and the trackers by name."""
 
-    microscope: Microscope = field(default_factory=lambda: Microscope(**ON_TABLE))
+    microscope: Microscope
     light: Light | None = None
     gain: float = 1.0
     noise: float = 2.0

@@ -80,7 +80,7 @@ def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None
     acquired = acquire(path, bench, tick)
     rest = REST_S * len(path) / COMMAND_HZ
     track, sensors = zeroed(acquired.tracks["ECC"], rest), zeroed(acquired.sensors, rest)
-    visual, sensed = circular(track), circular(sensors)
+    visual, sensed = portions(track)[1], portions(sensors)[1]
     points = sensors.pose[sensed, :2]
     turn = Calibration(1.0, bench.microscope.axis_angle)
     turned, image = (turn.to_physical(m.pose) for m in (acquired.tracks["ECC"], acquired.truth))
@@ -107,20 +107,23 @@ def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None
     )
 
 
-def circular(motion: Motion) -> Tensor:
-    """The circular portion as the record itself shows it: between the first and the last sample near the rim, (T,)."""
+def portions(motion: Motion) -> tuple[Tensor, Tensor, Tensor]:
+    """The straight way out, the circular portion and the way back, (T,) each, as the record itself shows them.
+
+    The circle is what lies between the first and the last sample near the rim.
+    """
     distance = motion.pose[:, :2].norm(dim=1).nan_to_num()
-    rim = (distance > ON_RIM * distance.max()).nonzero()[:, 0]
-    index = torch.arange(len(distance))
-    portion: Tensor = (index >= rim[0]) & (index <= rim[-1])
-    return portion
+    on_rim, low, high = (share * distance.max() for share in (ON_RIM, *ON_LINE))
+    rim, index = (distance > on_rim).nonzero()[:, 0], torch.arange(len(distance))
+    line = (distance > low) & (distance < high)
+    return line & (index < rim[0]), (index >= rim[0]) & (index <= rim[-1]), line & (index > rim[-1])
 
 
 def line_angle(track: Motion, sensors: Motion) -> float:
     """Angle in rad from the image's axes to the stage's by straight lines, mean of the ways out and back."""
     angles = []
-    for outward in (True, False):
-        image, stage = (fit_line(_line(motion, outward)).angle for motion in (track, sensors))
+    for way in (0, 2):
+        image, stage = (fit_line(motion.pose[portions(motion)[way], :2]).angle for motion in (track, sensors))
         angles.append(math.remainder(image - stage, math.tau))
     return sum(angles) / 2
 
@@ -129,16 +132,6 @@ def common_angle(found: list[Round]) -> float:
     """``line_angle`` of all circles together, weighted by what lines of such length tell: their length squared."""
     weights = [r.radius**2 for r in found]
     return sum(w * r.line_angle for w, r in zip(weights, found, strict=True)) / sum(weights)
-
-
-def _line(motion: Motion, outward: bool) -> Tensor:
-    """Points (N, 2) of the straight portion before, or after, the circle."""
-    distance = motion.pose[:, :2].norm(dim=1).nan_to_num()
-    rim = circular(motion).nonzero()[:, 0]
-    index = torch.arange(len(distance))
-    side = index < rim[0] if outward else index > rim[-1]
-    low, high = (share * distance.max() for share in ON_LINE)
-    return motion.pose[side & (distance > low) & (distance < high), :2]
 
 
 def _cut(motion: Motion, rows: Tensor) -> Motion:

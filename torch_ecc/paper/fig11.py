@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torch_ecc.paper.drawing import name_steps
 from torch_ecc.paper.errors import largest
-from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
-from torch_ecc.paper.steps import LAMP, METHODS, Staircase, staircase
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture
+from torch_ecc.paper.steps import LAMP, METHODS, staircase, step_table
 from torch_ecc.plots.style import new_figure
 
 STYLES = {"ECC": ("o-", "#0072b2"), "ECC, gain": ("s--", "#56b4e9"), "SSD": ("^-", "#d55e00")}
@@ -24,7 +24,7 @@ REMARKS = (
 def run(quick: bool, advance: Advance) -> Experiment:
     """Mean of each step minus that of the CDS, drawn as the paper's Fig. 11. ``quick``: dwells of 0.3 s."""
     found = staircase(quick, advance)
-    errors = {name: absolute(found, name) for name in METHODS}
+    errors = {name: (found.mean_deg(name) - found.mean_deg("CDS"))[1:] for name in METHODS}
     caption = (
         "Absolute measurement errors of theta, the average of each step minus that of the CDS, under uneven light."
     )
@@ -33,22 +33,10 @@ def run(quick: bool, advance: Advance) -> Experiment:
         worse = float((errors[name].abs() >= errors["SSD"].abs()).sum())
         limit = 0.0 if name == "ECC" else None
         records.append(Number(f"fig11 steps at which {name} is not better than SSD", worse, "", tolerance=limit))
-    picture, tables = Picture("fig11", draw(errors, found.levels_deg[1:]), caption), [_table(found, errors)]
-    return Experiment("fig11", "Fig. 11: absolute errors", [picture], tables, records, REMARKS)
-
-
-def absolute(found: Staircase, name: str) -> Tensor:
-    """Absolute errors (K - 1,) of theta in deg, of all steps but the first."""
-    errors: Tensor = found.absolute_errors(name)[1:, 2].rad2deg()
-    return errors
-
-
-def _table(found: Staircase, errors: dict[str, Tensor]) -> Table:
-    noise = found.dwells["ECC"].standard_error[1:, 2].rad2deg().tolist()
-    rows = []
-    for k, level in enumerate(found.levels_deg[1:].tolist()):
-        rows.append((f"{k + 1}", f"{level:.2f}", *cells([*(float(e[k]) for e in errors.values()), noise[k]], ".5f")))
-    return Table("Absolute errors of theta, deg", ("step", "commanded", *errors, "standard error"), rows)
+    levels, noise = found.levels_deg[1:], found.dwells["ECC"].standard_error[1:, 2].rad2deg()
+    table = step_table("Absolute errors of theta, deg", levels, errors | {"standard error": noise}, first=1)
+    picture = Picture("fig11", draw(errors, levels), caption)
+    return Experiment("fig11", "Fig. 11: absolute errors", [picture], [table], records, REMARKS)
 
 
 def draw(errors: dict[str, Tensor], levels_deg: Tensor) -> Figure:

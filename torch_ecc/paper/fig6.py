@@ -45,24 +45,17 @@ def _records(found: list[Round]) -> list[Number]:
     for r in found:
         name = f"fig6 {r.radius:g} um:"
         joint = abs(math.degrees(r.joint.axis_angle - true))
+        major, minor = r.ellipse.semi_axes.tolist()
+        oval = r.ellipse.residual_rms / r.circle.residual_rms
         lost = float((~r.track.pose.isfinite().all(1)).sum())
         records += [
             Number(f"{name} angle by the joint estimate, error", joint, "deg", tolerance=ANGLE_LIMIT),
-            Number(f"{name} major semi-axis over the commanded radius", _axes(r)[0] / r.radius, "", tolerance=1.0),
-            Number(f"{name} minor semi-axis over the commanded radius", _axes(r)[1] / r.radius, "", tolerance=1.0),
-            Number(f"{name} rms distance from an ellipse over that from a circle", _oval(r), "", tolerance=1.0),
+            Number(f"{name} major semi-axis over the commanded radius", major / r.radius, "", tolerance=1.0),
+            Number(f"{name} minor semi-axis over the commanded radius", minor / r.radius, "", tolerance=1.0),
+            Number(f"{name} rms distance from an ellipse over that from a circle", oval, "", tolerance=1.0),
             Number(f"{name} lost frames", lost, "", tolerance=0.0),
         ]
     return records
-
-
-def _axes(r: Round) -> list[float]:
-    axes: list[float] = r.ellipse.semi_axes.tolist()
-    return axes
-
-
-def _oval(r: Round) -> float:
-    return r.ellipse.residual_rms / r.circle.residual_rms
 
 
 def _table(found: list[Round]) -> Table:
@@ -70,7 +63,7 @@ def _table(found: list[Round]) -> Table:
     lines = {
         "circle fitted to the CDS data: radius, um": [f"{r.circle.radius:.3f}" for r in found],
         "  rms distance from the circle, nm": [f"{1e3 * r.circle.residual_rms:.0f}" for r in found],
-        "ellipse: semi-axes, um": ["{:.3f}, {:.3f}".format(*_axes(r)) for r in found],
+        "ellipse: semi-axes, um": ["{:.3f}, {:.3f}".format(*r.ellipse.semi_axes.tolist()) for r in found],
         "  rms distance from the ellipse, nm": [f"{1e3 * r.ellipse.residual_rms:.0f}" for r in found],
         "angle of image and stage, deg: straight lines": [f"{math.degrees(r.line_angle):.4f}" for r in found],
         "  joint estimate": [_with_sigma(r) for r in found],

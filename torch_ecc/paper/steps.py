@@ -6,6 +6,7 @@ Simulated once for all four figures.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -21,7 +22,7 @@ from torch_ecc.paper.acquisition import (
     microscope,
     zeroed,
 )
-from torch_ecc.paper.result import Advance, counter
+from torch_ecc.paper.result import Advance, Table, cells, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Dwells, Motion, dwell_errors
 from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
@@ -35,6 +36,13 @@ LAMP = 0.2  # of its light that the lamp gains in the first half of the staircas
 GAIN = 0.8  # of the camera, so that nothing is clipped at that
 SETTLE_S = 0.15  # after which a dwell is counted
 METHODS = {"ECC": {}, "ECC, gain": {"illumination": "gain"}, "SSD": {"criterion": "ssd"}}
+
+
+def step_table(title: str, levels_deg: Tensor, columns: Mapping[str, Tensor], first: int = 0) -> Table:
+    """Angles (K,) in deg by name beside those commanded at steps ``first``, ``first`` + 1, ..."""
+    values = zip(levels_deg.tolist(), *(column.tolist() for column in columns.values()), strict=True)
+    rows = [(f"{k}", f"{level:.2f}", *cells(row, ".5f")) for k, (level, *row) in enumerate(values, first)]
+    return Table(title, ("step", "commanded", *columns), rows)
 
 
 class Staircase(NamedTuple):
@@ -54,9 +62,10 @@ class Staircase(NamedTuple):
     windows_s: Tensor
     calibration: Calibration
 
-    def absolute_errors(self, method: str) -> Tensor:
-        """The paper's absolute errors (K, 3) um, um, rad: the mean of each step minus that of the CDS."""
-        return self.dwells[method].mean - self.dwells["CDS"].mean
+    def mean_deg(self, method: str) -> Tensor:
+        """Mean theta (K,) in deg of each step."""
+        theta: Tensor = self.dwells[method].mean[:, 2].rad2deg()
+        return theta
 
 
 def command(dwell_s: float) -> Tensor:
