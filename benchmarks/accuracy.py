@@ -19,7 +19,7 @@ from rich.table import Table
 from torch import Tensor
 
 from torch_ecc.paper.errors import by_unit, in_degrees, largest, rms
-from torch_ecc.paper.result import Number
+from torch_ecc.paper.result import Number, cells
 from torch_ecc.paper.scatter import Draws, Scatter, by_sampler, least, scatter
 from torch_ecc.paper.scheme import Harmonic
 from torch_ecc.paper.sequences import Run, track_path, under_light
@@ -48,37 +48,16 @@ def scatters(draws: int) -> list[Number]:
         for noise in (0.0, 2.0, 5.0, 10.0):
             for turn in (False, True):
                 s = scatter(scene, Draws(noise, draws, turn, seed=int(noise)))
-                cells = [f"{v:.5f}" for v in in_degrees(rms(s.error)).tolist()]
-                ratio = " ".join(f"{v:.2f}" for v in s.ratio)
+                errors, ratio = cells(in_degrees(rms(s.error)), ".5f"), " ".join(cells(s.ratio, ".2f"))
                 title = f"{name}, noise {noise:g}, {MOTIONS[turn]} / worst rms over the bound"
                 figures.append(Number(title, float(s.ratio.max()), "x", "lower", 0.1))
                 mean = f"{float(s.nees.mean()):.2f}"
                 iterations = f"{float(s.iterations.double().mean()):.1f}"
-                rows.append(
-                    (
-                        name,
-                        f"{noise:g}",
-                        MOTIONS[turn],
-                        *cells,
-                        ratio,
-                        mean,
-                        iterations,
-                        str(int((s.status != 0).sum())),
-                    )
-                )
-    header = (
-        "scene",
-        "noise",
-        "motion",
-        "x px",
-        "y px",
-        "theta deg",
-        "rms / bound",
-        "NEES",
-        "iterations",
-        "not converged",
-    )
-    show(f"Scatter, {draws} redrawn pairs (chance: {1 / math.sqrt(2 * draws):.0%} of an rms)", header, rows)
+                bad = str(int((s.status != 0).sum()))
+                rows.append((name, f"{noise:g}", MOTIONS[turn], *errors, ratio, mean, iterations, bad))
+    header = ("scene", "noise", "motion", "x px", "y px", "theta deg", "rms / bound", "NEES", "iterations", "bad")
+    chance = f"{1 / math.sqrt(2 * draws):.0%} of an rms"
+    show(f"Scatter, {draws} redrawn pairs (chance: {chance}); bad: not converged", header, rows)
     return figures
 
 
@@ -122,7 +101,7 @@ def _errors(error: Tensor) -> tuple[str, ...]:
 
 def _numbers(error: Tensor) -> tuple[str, ...]:
     """The worse of x and y, px, and theta, deg, of (3,) px, px, rad."""
-    return tuple(f"{v:.5f}" for v in by_unit(in_degrees(error)))
+    return tuple(cells(by_unit(in_degrees(error)), ".5f"))
 
 
 def sequences() -> list[Number]:
@@ -142,7 +121,7 @@ def sequences() -> list[Number]:
 
 
 def _cells(run: Run) -> tuple[str, ...]:
-    return (*(f"{v:.5f}" for v in (*run.rms, *run.largest)), str(run.lost))
+    return (*cells((*run.rms, *run.largest), ".5f"), str(run.lost))
 
 
 def lights() -> list[Number]:

@@ -64,7 +64,7 @@ def test_template_is_cut_around_its_start(size):
 def test_the_bound_of_a_template_that_lies_turned_is_along_its_own_axes():
     """Of gradients by autodiff of the scene as the template sees it."""
     scene, path = PlaneWaves.random(seed=3), scheme.TEXT.path()[7:8]
-    own = scheme.cut_first(path).own()
+    own = scheme.cut_first(path).place()
     y, x = torch.meshgrid(*(torch.arange(21) - 10.0,) * 2, indexing="ij")
     points = torch.stack((x.flatten(), y.flatten()), -1).double()
     moved = torch.func.jacfwd(lambda p: scene.value(transform(own, transform(p, points))))(torch.zeros(3).double())

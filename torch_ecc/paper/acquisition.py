@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Status, Track
+from torch_ecc.paper.errors import valid
 from torch_ecc.paper.result import Advance, Table, cells
+from torch_ecc.paper.scheme import SIZE
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Motion
 from torch_ecc.sim import Floor, Microscope, Sensors, Sequence, Stage, StageMotion, StageSettings, micrograph
@@ -22,14 +24,10 @@ from torch_ecc.sim.camera.light import Light
 from torch_ecc.sim.scene.window import Window
 from torch_ecc.track.tracker import Tracker
 
-SIZE = 121  # px, the paper's template
 AROUND = 16  # px drawn around it: all that a tracker reads
 COMMAND_HZ = 1000.0
 QUIET = Floor(speed_um_s=0.78)  # VC-G: an isolated table (Amick et al., SPIE 5933, 2005)
-# Of the microscope: a stiff column on that table, and a strobe (2 ms of light would smear 0.05 um at most).
-ON_TABLE: Mapping[str, Any] = {"floor": QUIET, "column_hz": 90.0, "exposure_s": 0.0}
 CAMERA_START_S = 0.2137  # of the stage's clock; the sensors start with the stage
-METHODS: Mapping[str, Mapping[str, Any]] = {"ECC": {}}
 T = TypeVar("T")
 
 
@@ -41,7 +39,7 @@ class Bench:
     light: Light | None = None
     gain: float = 1.0
     noise: float = 2.0
-    methods: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: METHODS)
+    methods: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"ECC": {}})
     seed: int = 0
 
 
@@ -89,7 +87,7 @@ def acquire(command: Tensor, bench: Bench, tick: Callable[[], None]) -> Acquisit
     return Acquisition(motions, read, Motion(times, truth), motion, offset, seconds, first)
 
 
-def acquired_once(simulate: Callable[[bool, Advance], T]) -> Callable[[bool, Advance], T]:
+def simulated_once(simulate: Callable[[bool, Advance], T]) -> Callable[[bool, Advance], T]:
     """``simulate(quick, advance)`` at the first call only; later ones get what that one returned."""
     kept: dict[bool, T] = {}
 
@@ -103,8 +101,12 @@ def acquired_once(simulate: Callable[[bool, Advance], T]) -> Callable[[bool, Adv
 
 
 def microscope(quick: bool, **options: Any) -> Microscope:
-    """The microscope on its table; ``quick``: it reads a smaller part of its sensor."""
-    return Microscope(region_px=(240, 320) if quick else (480, 640), **ON_TABLE, **options)
+    """A stiff column on that table, and a strobe (2 ms of light would smear 0.05 um at most).
+
+    ``quick``: it reads a smaller part of its sensor.
+    """
+    region = (240, 320) if quick else (480, 640)
+    return Microscope(region_px=region, floor=QUIET, column_hz=90.0, exposure_s=0.0, **options)
 
 
 def times(acquired: Mapping[str, Acquisition]) -> Table:
@@ -124,7 +126,7 @@ def tracker_of(first: Tensor, **options: Any) -> Tracker:
 def zeroed(motion: Motion, rest_s: float) -> Motion:
     """The record from the mean of its first ``rest_s`` s, in which the stage rests."""
     rest = motion.pose[motion.time_s < motion.time_s[0] + rest_s]
-    return Motion(motion.time_s, motion.pose - rest[rest.isfinite().all(1)].mean(0))
+    return Motion(motion.time_s, motion.pose - valid(rest).mean(0))
 
 
 def frames_of(command: Tensor, bench: Bench) -> int:

@@ -15,10 +15,10 @@ from torch_ecc.paper.acquisition import (
     Acquisition,
     Bench,
     acquire,
-    acquired_once,
     ease,
     frames_of,
     microscope,
+    simulated_once,
     zeroed,
 )
 from torch_ecc.paper.errors import valid
@@ -58,7 +58,7 @@ class Round(NamedTuple):
     parts: dict[str, Tensor]
 
 
-@acquired_once
+@simulated_once
 def rounds(quick: bool, advance: Advance) -> list[Round]:
     """Both circles; simulated at the first call only. ``quick``: twice as fast, and a smaller part of the sensor."""
     bench = Bench(microscope=microscope(quick, zoom=ZOOM))

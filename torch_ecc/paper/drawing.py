@@ -29,7 +29,7 @@ def draw_range(axes: Axes, limit: float, label: str | None = None) -> None:
     axes.axhline(limit, color="0.4", lw=0.9, ls=":", label=label)
 
 
-def own_scale(axes: Axes) -> Axes:
+def second_scale(axes: Axes) -> Axes:
     """A second vertical scale, on the right, for another unit."""
     other = axes.twinx()
     other.grid(visible=False)
@@ -37,6 +37,6 @@ def own_scale(axes: Axes) -> Axes:
     return other
 
 
-def name_steps(axes: Axes, levels_deg: Tensor, **options: Any) -> None:
+def label_steps(axes: Axes, levels_deg: Tensor, **options: Any) -> None:
     """What was commanded (K,) in deg below each step 1, 2, ... K."""
     axes.set_xticks(range(1, len(levels_deg) + 1), [f"{level:.2f}" for level in levels_deg.tolist()], **options)

@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ecc.paper.drawing import draw_box, draw_range, name_steps
+from torch_ecc.paper.drawing import draw_box, draw_range, label_steps
 from torch_ecc.paper.errors import box, largest, rms
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
 from torch_ecc.paper.steps import Staircase, staircase
@@ -56,7 +56,7 @@ def draw(errors: dict[str, list[Tensor]], found: Staircase) -> Figure:
         for x, step in enumerate(steps, 1):
             draw_box(axes, x, step)
         draw_range(axes, MAIN_DEG[name])
-        name_steps(axes, found.levels_deg, rotation=45)
+        label_steps(axes, found.levels_deg, rotation=45)
         axes.set(xlabel="step (deg)", ylabel="mean error (deg)")
         letter(axes, f"({'ab'[k]}) {name}")
     return figure

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ecc.paper.drawing import name_steps
+from torch_ecc.paper.drawing import label_steps
 from torch_ecc.paper.errors import largest
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture
 from torch_ecc.paper.steps import LAMP, METHODS, staircase, step_table
@@ -48,7 +48,7 @@ def draw(errors: dict[str, Tensor], levels_deg: Tensor) -> Figure:
         marks, colour = STYLES[name]
         axes.plot(steps, values, marks, color=colour, ms=4, label=name)
     axes.axhline(0, color="0.6", lw=0.8)
-    name_steps(axes, levels_deg)
+    label_steps(axes, levels_deg)
     axes.set(xlabel="step (deg), up and down", ylabel="absolute error (deg)")
     axes.legend()
     return figure

@@ -8,7 +8,7 @@ from torch_ecc.commands.servo import draw_three_steps
 from torch_ecc.commands.servo_job import ServoJob, prepare_parts, run_alignment, setting
 from torch_ecc.commands.servo_pictures import draw_errors
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, counter
-from torch_ecc.paper.servo_trials import cells_of
+from torch_ecc.paper.servo_trials import error_cells
 
 EXPECTED = 260  # frames, for the progress only
 LIMIT_PX, LIMIT_DEG = 0.1, 0.02
@@ -25,7 +25,7 @@ def run(quick: bool, advance: Advance) -> Experiment:
     off, miss, nm = math.hypot(x, y), float(found.miss.norm()), 1e3 * job.cell.mounts["substrate"].um_per_px
     titles = ["step 2: the substrate", "step 3: the probe"]
     rows = [
-        (title, str(len(log.time)), f"{float(log.time[-1]):.2f}", *cells_of(log.error[0]), *cells_of(log.error[-1]))
+        (title, f"{len(log.time)}", f"{log.time[-1]:.2f}", *error_cells(log.error[0]), *error_cells(log.error[-1]))
         for title, log in zip(titles, logs, strict=False)
     ]
     header = ("step", "frames", "s", "x px", "y px", "theta deg", "x px, end", "y px, end", "theta deg, end")

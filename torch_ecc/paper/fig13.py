@@ -6,7 +6,7 @@ from typing import Any
 
 from torch_ecc.commands.servo_pictures import draw_errors, draw_velocities
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, counter
-from torch_ecc.paper.servo_trials import Single, cells_of, single
+from torch_ecc.paper.servo_trials import Single, error_cells, single
 from torch_ecc.servo.record import decay_rate
 
 CLEAN: dict[str, Any] = {
@@ -58,7 +58,7 @@ def run(quick: bool, advance: Advance) -> Experiment:
         Picture("fig13_decay", draw_errors([clean.result.log], ["Without noise"], GAIN), "Errors without noise."),
     ]
     rows = [
-        (name, r.result.ending.name, f"{float(r.result.log.time[-1]):.2f}", *cells_of(r.error))
+        (name, r.result.ending.name, f"{float(r.result.log.time[-1]):.2f}", *error_cells(r.error))
         for name, r in runs.items()
     ]
     header = ("belief", "ending", "s", "x px", "y px", "theta deg")

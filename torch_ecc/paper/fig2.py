@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torch_ecc.paper import scheme
-from torch_ecc.paper.drawing import own_scale
+from torch_ecc.paper.drawing import second_scale
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
 from torch_ecc.plots.style import COMPONENTS, letter, new_figure
 from torch_ecc.sim import Retinex
@@ -101,7 +101,7 @@ def _amplitude(path: Tensor) -> float:
 
 
 def _draw_components(axes: Axes, paths: list[Tensor]) -> None:
-    turn = own_scale(axes)
+    turn = second_scale(axes)
     for path, (dashes, _) in zip(paths, LINES, strict=True):
         j = range(1, len(path) + 1)
         axes.plot(j, path[:, 0], dashes, color=COLOURS[0], label=f"{COMPONENTS[0]} = {COMPONENTS[1]} (Nop {len(path)})")

@@ -109,7 +109,7 @@ def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None
     noisy = bool((cut.pose == path[0]).all())
     still = scheme.Kept(scene, scene.render(cut.pose[None], scheme.FRAME))
     many = torch.zeros(DRAWS, dtype=torch.long)
-    bound = in_degrees(cramer_rao(scene, (scheme.SIZE, scheme.SIZE), 2.0 if noisy else 1.0, cut.own()))
+    bound = in_degrees(cramer_rao(scene, (scheme.SIZE, scheme.SIZE), 2.0 if noisy else 1.0, cut.place()))
     cameras = {v: Camera(size=scheme.FRAME, noise_sigma=noise_sigma(v)) for v in VARIANCES}
     found: dict[float, dict[str, list[Tensor]]] = {v: {m: [] for m in COMPARED} for v in VARIANCES}
     followers: dict[str, Follower] = {}
@@ -153,10 +153,8 @@ def _records(kind: str, found: dict[str, Noisy]) -> list[Number]:
     records = []
     for variance, noisy in found.items():
         for name in COMPARED:
-            label, limit = (
-                f"fig4 {kind} template, variance {variance}, {name}",
-                RATIO_LIMIT if name == "linear" else None,
-            )
+            label = f"fig4 {kind} template, variance {variance}, {name}"
+            limit = RATIO_LIMIT if name == "linear" else None
             (side, turn), (far, far_turn) = noisy.extent(name)
             records += [
                 Number(f"{label}, rms over the bound", noisy.over(name), "1", tolerance=limit),
@@ -169,13 +167,18 @@ def _records(kind: str, found: dict[str, Noisy]) -> list[Number]:
 
 
 def _remarks(found: dict[str, dict[str, Noisy]]) -> list[str]:
-    boxes = "; ".join(f"{kind} template {_boxes(noisy)}" for kind, noisy in found.items())
-    over = "; ".join(f"{kind} template: {_all_over(noisy)}" for kind, noisy in found.items())
+    boxes, over = [], []
+    for kind, by_variance in found.items():
+        extents = [noisy.extent("linear") for noisy in by_variance.values()]
+        boxes.append(f"{kind} template " + ", ".join(f"{side:.3f} ({far:.3f})" for (side, _), (far, _) in extents))
+        ratios = (f"{m} " + " ".join(f"{noisy.over(m):.2f}" for noisy in by_variance.values()) for m in COMPARED)
+        over.append(f"{kind} template: {', '.join(ratios)}")
     remarks = [
-        f"Boxes (and largest errors) of x and y with ecc at the three variances: {boxes}. Paper: within 0.02 px "
-        "(0.05). The largest of so many draws is some 3.5 times the standard deviation, whatever the method.",
+        f"Boxes (and largest errors) of x and y with ecc at the three variances: {' px; '.join(boxes)} px. Paper: "
+        "within 0.02 px (0.05). The largest of so many draws is some 3.5 times the standard deviation, whatever the "
+        "method.",
         "No unbiased method can scatter less than the Cramer-Rao bound. Rms over it at the three variances: "
-        f"{over}. What is left of the errors belongs to the images.",
+        f"{'; '.join(over)}. What is left of the errors belongs to the images.",
         "In theta the paper sees ECC ahead of SSD under noise. With equal samplers, equal gradients and one stop rule "
         "there is no such difference, and there can be none: in even light SSD has fewer unknowns, not more.",
         "ref. 34 is given the gradient of the slightly blurred template. With raw differences, which hold the "
@@ -190,14 +193,3 @@ def _remarks(found: dict[str, dict[str, Noisy]]) -> list[str]:
             "frame before do not always suffice for ssd; with more it scatters as the others do."
         )
     return remarks
-
-
-def _boxes(found: dict[str, Noisy]) -> str:
-    """Box and largest error of ecc's x and y at each variance, in words."""
-    extents = [noisy.extent("linear") for noisy in found.values()]
-    return ", ".join(f"{side:.3f} ({far:.3f})" for (side, _), (far, _) in extents) + " px"
-
-
-def _all_over(found: dict[str, Noisy]) -> str:
-    """Rms over the bound at each variance, by method, in words."""
-    return ", ".join(f"{m} " + " ".join(f"{noisy.over(m):.2f}" for noisy in found.values()) for m in COMPARED)

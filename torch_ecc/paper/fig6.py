@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from torch_ecc.paper.acquisition import times
 from torch_ecc.paper.circles import Round, common_angle, rounds
-from torch_ecc.paper.drawing import own_scale
+from torch_ecc.paper.drawing import second_scale
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
 from torch_ecc.plots.style import COMPONENTS, letter, new_figure
 
@@ -123,7 +123,7 @@ def _draw_plane(axes: Axes, found: list[Round], *, legend: bool) -> None:
 
 def _draw_parts(axes: Axes, found: list[Round]) -> None:
     """x and y of the vision method; theta, which stays within its noise, on its own scale."""
-    turn = own_scale(axes)
+    turn = second_scale(axes)
     for k, r in enumerate(found):
         for i, dashes in enumerate(("-", "--")):
             label = f"{COMPONENTS[i]}, {r.radius:g} um"

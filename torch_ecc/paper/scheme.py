@@ -68,10 +68,10 @@ class Cut(NamedTuple):
 
     def truth(self, path: Tensor) -> Tensor:
         """Exact poses (F, 3) of the template when the scene moves along ``path`` (F, 3)."""
-        return compose(path, self.own().expand_as(path))
+        return compose(path, self.place().expand_as(path))
 
-    def own(self) -> Tensor:
-        """Poses of the templates in the scene, as those of the cut."""
+    def place(self) -> Tensor:
+        """Poses of the templates in the scene, (3,) or (F, 3) as ``pose`` is."""
         return compose(inverse(self.pose), self.start.expand_as(self.pose))
 
     def template(self, image: Tensor, size: int = SIZE) -> Tensor:

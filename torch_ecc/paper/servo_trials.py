@@ -67,7 +67,7 @@ def trial(values: Mapping[str, Any]) -> Trial:
     )
 
 
-def cells_of(error: Tensor) -> list[str]:
+def error_cells(error: Tensor) -> list[str]:
     """An error (3,) px, px, rad as a table shows it."""
     x, y, theta = in_degrees(error).tolist()
     return [*cells((x, y), ".3f"), *cells((theta,), ".4f")]

@@ -17,9 +17,9 @@ from torch_ecc.paper.acquisition import (
     Acquisition,
     Bench,
     acquire,
-    acquired_once,
     frames_of,
     microscope,
+    simulated_once,
     zeroed,
 )
 from torch_ecc.paper.result import Advance, Table, cells, counter
@@ -75,7 +75,7 @@ def command(dwell_s: float) -> Tensor:
     return torch.stack((0 * turn, 0 * turn, turn), -1)
 
 
-@acquired_once
+@simulated_once
 def staircase(quick: bool, advance: Advance) -> Staircase:
     """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
     dwell_s = 0.3 if quick else 3.0
