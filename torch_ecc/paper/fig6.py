@@ -60,22 +60,19 @@ def _records(found: list[Round]) -> list[Number]:
 
 def _table(found: list[Round]) -> Table:
     header = ("", *(f"{r.radius:g} um" for r in found))
+    joint = [(r.joint.axis_angle, r.joint.sigma["axis_angle_rad"]) for r in found]
     lines = {
         "circle fitted to the CDS data: radius, um": [f"{r.circle.radius:.3f}" for r in found],
         "  rms distance from the circle, nm": [f"{1e3 * r.circle.residual_rms:.0f}" for r in found],
         "ellipse: semi-axes, um": ["{:.3f}, {:.3f}".format(*r.ellipse.semi_axes.tolist()) for r in found],
         "  rms distance from the ellipse, nm": [f"{1e3 * r.ellipse.residual_rms:.0f}" for r in found],
         "angle of image and stage, deg: straight lines": [f"{math.degrees(r.line_angle):.4f}" for r in found],
-        "  joint estimate": [_with_sigma(r) for r in found],
+        "  joint estimate": [f"{math.degrees(a):.4f} +- {math.degrees(s):.4f}" for a, s in joint],
         "  true": [f"{math.degrees(r.axis_angle):.4f}" for r in found],
     }
     rows = [(name, *cells) for name, cells in lines.items()]
     note = "The angle by all straight lines together: " + f"{math.degrees(common_angle(found)):.4f} deg."
     return Table("What the trajectories were", header, rows, note)
-
-
-def _with_sigma(r: Round) -> str:
-    return f"{math.degrees(r.joint.axis_angle):.4f} +- {math.degrees(r.joint.sigma['axis_angle_rad']):.4f}"
 
 
 def draw(found: list[Round]) -> Figure:

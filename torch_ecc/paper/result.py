@@ -78,9 +78,10 @@ def counter(total: int, advance: Advance) -> Callable[[], None]:
     return lambda: advance(min(next(done), total), total)
 
 
-def cells(values: Iterable[float] | Tensor, form: str) -> list[str]:
-    """Numbers as a table shows them."""
-    return [f"{value:{form}}" for value in (values.tolist() if isinstance(values, Tensor) else values)]
+def cells(values: Iterable[float] | Tensor, form: str, sigma: Tensor | None = None) -> list[str]:
+    """Numbers as a table shows them, with their standard deviations ``sigma`` where these are given."""
+    texts = [f"{value:{form}}" for value in (values.tolist() if isinstance(values, Tensor) else values)]
+    return texts if sigma is None else [f"{a} +- {b}" for a, b in zip(texts, cells(sigma, form), strict=True)]
 
 
 def environment() -> dict[str, str]:
