@@ -27,18 +27,18 @@ from torch_ecc.track.tracker import Tracker
 AROUND = 16  # px drawn around it: all that a tracker reads
 COMMAND_HZ = 1000.0
 QUIET = Floor(speed_um_s=0.78)  # VC-G: an isolated table (Amick et al., SPIE 5933, 2005)
+NOISE = 2.0  # of the camera, grey levels
 CAMERA_START_S = 0.2137  # of the stage's clock; the sensors start with the stage
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Settings: microscope, light, ``gain`` and ``noise`` of the camera in grey levels, and the trackers by name."""
+    """Settings: microscope, light, ``gain`` of the camera, and the trackers by name."""
 
     microscope: Microscope
     light: Light | None = None
     gain: float = 1.0
-    noise: float = 2.0
     methods: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"ECC": {}})
     seed: int = 0
 
@@ -144,7 +144,7 @@ def _film(motion: StageMotion, bench: Bench) -> Sequence:
     """The lens' point-spread and the pixel's own width blur the analytic scene exactly, instead of its pixels."""
     microscope = bench.microscope
     spread = (microscope.camera().blur_sigma ** 2 + 1 / 12) ** 0.5
-    settings = {"light": bench.light, "gain": bench.gain, "noise_sigma": bench.noise}
+    settings = {"light": bench.light, "gain": bench.gain, "noise_sigma": NOISE}
     camera = microscope.camera(blur_sigma=0.0, **settings)
     side = SIZE + 2 * AROUND
     scene = Window(micrograph(sigma=spread), (side, side))

@@ -15,9 +15,7 @@ from torch_ecc.core.pose import retract
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.sampling import Sampler, make_sampler
 from torch_ecc.core.solver import warps
-from torch_ecc.paper.ref34 import Ref34
-
-PAPER_ITERATIONS = 15
+from torch_ecc.paper.ref34 import PAPER_ITERATIONS, Ref34
 
 
 class Aligned:
@@ -74,7 +72,7 @@ class Method(NamedTuple):
     def start(self, templates: Tensor, pose: Tensor, interpolation: str = "bspline3") -> Follower:
         """A follower of templates (R, 1, h + 2 MARGIN, w + 2 MARGIN) that are at poses (R, 3) now."""
         if self.options is None:
-            return Ref34(templates, pose, interpolation=interpolation, max_iterations=PAPER_ITERATIONS)
+            return Ref34(templates, pose, interpolation)
         return Aligned(templates, pose, self.options, interpolation)
 
 

@@ -36,7 +36,6 @@ class Draws:
     noise: float = 0.0
     count: int = 250
     turn: bool = True
-    illumination: str = "linear"
     interpolation: str = "bspline3"
     bits: int | None = 8
     seed: int = 0
@@ -97,7 +96,7 @@ def by_sampler(scene: Scene, draws: Draws, samplers: tuple[str, ...]) -> dict[st
     truth = []
     for pair in pairs(scene, draws):
         near = pair.truth + torch.tensor([0.3, -0.3, math.radians(0.17)])
-        reference = prepared(pair.cut.template(pair.first), {"illumination": draws.illumination})
+        reference = prepared(pair.cut.template(pair.first), {})
         for name, estimates in found.items():
             estimates.append(align(reference, pair.next, near, interpolation=name))
         truth.append(pair.truth)

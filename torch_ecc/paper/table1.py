@@ -15,7 +15,8 @@ from torch import Tensor
 
 from torch_ecc.core.sampling import Sampler
 from torch_ecc.paper import scheme
-from torch_ecc.paper.methods import METHODS, PAPER_ITERATIONS, Follower
+from torch_ecc.paper.methods import METHODS, Follower
+from torch_ecc.paper.ref34 import PAPER_ITERATIONS
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
 from torch_ecc.plots.style import letter, new_figure
 from torch_ecc.sim import Camera
