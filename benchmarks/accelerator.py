@@ -14,7 +14,7 @@ from pathlib import Path
 
 import click
 import torch
-from results import Figure, save
+from results import save
 from rich.console import Console
 from scaling import SCENE, spread
 from torch import Tensor
@@ -25,7 +25,8 @@ from torch_ecc.core.align import solve_in_torch
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import stages
-from torch_ecc.paper.accuracy import Harmonic
+from torch_ecc.paper.result import Number
+from torch_ecc.paper.scheme import Harmonic
 from torch_ecc.sim import Camera, Sequence
 
 FRAME = (480, 640)
@@ -134,13 +135,13 @@ def main(device: str, count: int | None, frames: int, size: int, iterations: int
     """Poses per second, share of the roofline, agreement with the CPU, by sampler."""
     place = torch.device(device)
     count = count or (4096 if place.type == "cuda" else 16)
-    first, *rest = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).path(Camera()), Camera())
+    first, *rest = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).closed(), Camera())
     tracker = Tracker(first, spread(count, size + 40, FRAME).round(), size, device=place)
     images, rate = [view[None].to(place) for view in rest], copy_rate(place)
     console.print(
         f"{place}: copies {rate / 1e9:.1f} GB/s; {count} templates of {size} px in each of {len(rest)} frames"
     )
-    figures = [Figure("copy rate", rate / 1e9, "GB/s", "higher")]
+    figures = [Number("copy rate", rate / 1e9, "GB/s", "higher")]
     for sampler in ("bilinear", "bspline3"):
         settings = Settings(sampler, iterations, backend="torch")
         speed, apart = measure(tracker.references[0], images, tracker.pose, settings)
@@ -150,9 +151,9 @@ def main(device: str, count: int | None, frames: int, size: int, iterations: int
             f"{speed * least / rate:.1%} of the roofline; {apart:.1e} px or rad from the CPU's poses"
         )
         figures += [
-            Figure(f"{sampler}: poses", speed, "1/s", "higher", 0.3),
-            Figure(f"{sampler}: share of the roofline", speed * least / rate, "", "higher", 0.3),
-            Figure(f"{sampler}: from the CPU's poses", apart, "px"),
+            Number(f"{sampler}: poses", speed, "1/s", "higher", 0.3),
+            Number(f"{sampler}: share of the roofline", speed * least / rate, "", "higher", 0.3),
+            Number(f"{sampler}: from the CPU's poses", apart, "px"),
         ]
     if out:
         save(out, figures, device=str(place), count=str(count), size=str(size), iterations=str(iterations))

@@ -13,12 +13,16 @@ from pathlib import Path
 
 import click
 import torch
-from results import Figure, save
+from results import save
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from torch_ecc.paper.accuracy import Draws, Harmonic, Scatter, by_sampler, least, scatter, track_path, under_light
+from torch_ecc.paper.errors import by_unit, in_degrees, largest, rms
+from torch_ecc.paper.result import Number, cells
+from torch_ecc.paper.scatter import Draws, Scatter, by_sampler, least, scatter
+from torch_ecc.paper.scheme import Harmonic
+from torch_ecc.paper.sequences import Run, track_path, under_light
 from torch_ecc.sim.camera.camera import Camera
 from torch_ecc.sim.camera.light import GradientLight, SpotLight
 from torch_ecc.sim.camera.sequence import Sequence
@@ -38,48 +42,26 @@ def show(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> No
     console.print(table)
 
 
-def scatters(draws: int) -> list[Figure]:
+def scatters(draws: int) -> list[Number]:
     rows, figures = [], []
     for name, scene in SCENES.items():
         for noise in (0.0, 2.0, 5.0, 10.0):
             for turn in (False, True):
                 s = scatter(scene, Draws(noise, draws, turn, seed=int(noise)))
-                rms = s.error.square().mean(0).sqrt().tolist()
-                cells = [f"{v:.5f}" for v in (rms[0], rms[1], math.degrees(rms[2]))]
-                ratio = " ".join(f"{v:.2f}" for v in s.ratio)
+                errors, ratio = cells(in_degrees(rms(s.error)), ".5f"), " ".join(cells(s.ratio, ".2f"))
                 title = f"{name}, noise {noise:g}, {MOTIONS[turn]} / worst rms over the bound"
-                figures.append(Figure(title, float(s.ratio.max()), "x", "lower", 0.1))
+                figures.append(Number(title, float(s.ratio.max()), "x", "lower", 0.1))
                 mean = f"{float(s.nees.mean()):.2f}"
                 iterations = f"{float(s.iterations.double().mean()):.1f}"
-                rows.append(
-                    (
-                        name,
-                        f"{noise:g}",
-                        MOTIONS[turn],
-                        *cells,
-                        ratio,
-                        mean,
-                        iterations,
-                        str(int((s.status != 0).sum())),
-                    )
-                )
-    header = (
-        "scene",
-        "noise",
-        "motion",
-        "x px",
-        "y px",
-        "theta deg",
-        "rms / bound",
-        "NEES",
-        "iterations",
-        "not converged",
-    )
-    show(f"Scatter, {draws} redrawn pairs (chance: {1 / math.sqrt(2 * draws):.0%} of an rms)", header, rows)
+                bad = str(int((s.status != 0).sum()))
+                rows.append((name, f"{noise:g}", MOTIONS[turn], *errors, ratio, mean, iterations, bad))
+    header = ("scene", "noise", "motion", "x px", "y px", "theta deg", "rms / bound", "NEES", "iterations", "bad")
+    chance = f"{1 / math.sqrt(2 * draws):.0%} of an rms"
+    show(f"Scatter, {draws} redrawn pairs (chance: {chance}); bad: not converged", header, rows)
     return figures
 
 
-def poses(count: int) -> list[Figure]:
+def poses(count: int) -> list[Number]:
     """Errors without noise, start 0.3 px and 0.17 deg off, by sampler; unrounded, and in 8 bit beside those of an
     oracle: the scene itself fitted to the same frames by least squares."""
     rows, figures = [], []
@@ -91,9 +73,9 @@ def poses(count: int) -> list[Figure]:
                 rows += [(name, motion, *row) for row in _by_error(found, least(scene, draws) if bits else None)]
                 for sampler, s in found.items():
                     title = f"{name}, {motion}, {sampler}{'' if bits else ', unrounded'} / largest error"
-                    px, deg = _pair(s.error.abs().amax(0))
-                    figures.append(Figure(title, px, "px", "lower", 0.1))
-                    figures.append(Figure(f"{title}, theta", deg, "deg", "lower", 0.1))
+                    px, deg = by_unit(in_degrees(largest(s.error)))
+                    figures.append(Number(title, px, "px", "lower", 0.1))
+                    figures.append(Number(f"{title}, theta", deg, "deg", "lower", 0.1))
     header = ("scene", "motion", "bits", "sampler", "bad", "largest px", "deg", "rms px", "deg", "off oracle px", "deg")
     show(f"{count} random poses, no noise; bad: not converged; off oracle: largest difference", header, rows)
     return figures
@@ -103,7 +85,7 @@ def _by_error(found: dict[str, Scatter], best: Tensor | None) -> list[tuple[str,
     """Rows by sampler; where the oracle's errors (draws, 3) are given, these and the Cramer-Rao bound too."""
     rows = []
     for sampler, s in found.items():
-        off = () if best is None else _numbers((s.error - best).abs().amax(0))
+        off = () if best is None else _numbers(largest(s.error - best))
         bad = str(int((s.status != 0).sum()))
         rows.append(("none" if best is None else "8", sampler, bad, *_errors(s.error), *off))
     if best is not None:
@@ -114,27 +96,22 @@ def _by_error(found: dict[str, Scatter], best: Tensor | None) -> list[tuple[str,
 
 def _errors(error: Tensor) -> tuple[str, ...]:
     """Largest and root mean square of (draws, 3)."""
-    return (*_numbers(error.abs().amax(0)), *_numbers(error.square().mean(0).sqrt()))
+    return (*_numbers(largest(error)), *_numbers(rms(error)))
 
 
 def _numbers(error: Tensor) -> tuple[str, ...]:
-    return tuple(f"{v:.5f}" for v in _pair(error))
+    """The worse of x and y, px, and theta, deg, of (3,) px, px, rad."""
+    return tuple(cells(by_unit(in_degrees(error)), ".5f"))
 
 
-def _pair(error: Tensor) -> tuple[float, float]:
-    """The worse of x and y, px, and theta, deg, of (3,)."""
-    x, y, theta = error.tolist()
-    return max(x, y), math.degrees(theta)
-
-
-def sequences() -> list[Figure]:
+def sequences() -> list[Number]:
     rows, figures = [], []
     scene = SCENES["waves"]
     for noise in (0.0, 2.0, 5.0, 10.0):
         camera = Camera(noise_sigma=noise)
-        run = track_path(Sequence(scene, Harmonic().path(camera), camera))
+        run = track_path(Sequence(scene, Harmonic().closed(), camera))
         rows.append(("eq. (11), 20 px, 5 deg", f"{noise:g}", *_cells(run)))
-        figures.append(Figure(f"eq. (11), noise {noise:g} / rms", run.rms[0], "px", "lower", 0.1))
+        figures.append(Number(f"eq. (11), noise {noise:g} / rms", run.rms[0], "px", "lower", 0.1))
     angles = torch.arange(0, 722, 2) * math.pi / 180
     camera = Camera(size=(221, 221))
     path = torch.stack((110 + 0 * angles, 110 + 0 * angles, angles), -1).double()
@@ -143,18 +120,18 @@ def sequences() -> list[Figure]:
     return figures
 
 
-def _cells(run) -> tuple[str, ...]:
-    return (*(f"{v:.5f}" for v in (*run.rms, *run.largest)), str(run.lost))
+def _cells(run: Run) -> tuple[str, ...]:
+    return (*cells((*run.rms, *run.largest), ".5f"), str(run.lost))
 
 
-def lights() -> list[Figure]:
+def lights() -> list[Number]:
     rows, figures = [], []
     for light in (None, GradientLight(scale_px=640), SpotLight(scale_px=640)):
         for name, scene in SCENES.items():
             for method, run in under_light(scene, light, Harmonic(50.0, 10.0, 60)).items():
                 kind = type(light).__name__ if light else "even"
                 rows.append((kind, name, method, *_cells(run)))
-                figures.append(Figure(f"{kind}, {name}, {method} / largest", run.largest[0], "px", "lower", 0.1))
+                figures.append(Number(f"{kind}, {name}, {method} / largest", run.largest[0], "px", "lower", 0.1))
     header = ("light", "scene", "method", "rms px", "rms deg", "largest px", "largest deg", "lost")
     show("Uneven light, no noise, eq. (11) with 50 px and 10 deg", header, rows)
 
@@ -169,7 +146,7 @@ def lights() -> list[Figure]:
 def main(draws: int, count: int, only: tuple[str, ...], out: Path | None) -> None:
     """Print what the README quotes."""
     torch.set_num_threads(1)
-    sections: dict[str, Callable[[], list[Figure]]] = {
+    sections: dict[str, Callable[[], list[Number]]] = {
         "scatters": lambda: scatters(draws),
         "poses": lambda: poses(count),
         "sequences": sequences,

@@ -16,7 +16,7 @@ import click
 import cv2
 import torch
 from comparison import BLOCK
-from results import Figure, save
+from results import save
 from rich.console import Console
 from rich.table import Table
 from rivals import rivals
@@ -25,7 +25,8 @@ from torch import Tensor
 from trackers import options
 
 from torch_ecc import Tracker
-from torch_ecc.paper.accuracy import SIZE, Harmonic
+from torch_ecc.paper.result import Number
+from torch_ecc.paper.scheme import SIZE, Harmonic
 from torch_ecc.sim import Camera, Sequence
 
 YARDSTICK = "OpenCV ECC, fastest fair"
@@ -75,7 +76,7 @@ def main(count: int, threads: int, out: Path | None) -> None:
     """Templates per second, time of one iteration of a template, and errors, side by side."""
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
-    sequence = Sequence(SCENE, MOTION.path(Camera()), Camera())
+    sequence = Sequence(SCENE, MOTION.closed(), Camera())
     frames, centers = list(sequence), spread(count, SIZE + ROOM, (480, 640)).round()
     each: dict[str, float] = {}
     follow = {YARDSTICK: loop(frames[0], centers)}
@@ -124,8 +125,8 @@ def _show(title: str, taken: Times, errors: dict[str, list[Tensor]], each: dict[
         )
         table.add_row(name, *cells)
         mine = None if name == YARDSTICK else 0.5
-        figures.append(Figure(f"{title} / {name} / over OpenCV's", ratio, "x", "higher", mine))
-        figures.append(Figure(f"{title} / {name} / rms", max(x, y), "px", "lower", mine and 0.15))
+        figures.append(Number(f"{title} / {name} / over OpenCV's", ratio, "x", "higher", mine))
+        figures.append(Number(f"{title} / {name} / rms", max(x, y), "px", "lower", mine and 0.15))
     console.print(table)
     if out is not None:
         save(out, figures)

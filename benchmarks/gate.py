@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import click
-from results import Figure, Result, load
+from results import Result, load
 from rich.console import Console
 from rich.table import Table
+
+from torch_ecc.paper.result import Number
 
 LEAST = {"px": 1e-4, "deg": 1e-4}  # differences below are the rounding of another processor
 MACHINE_BOUND = ("ms", "us", "MB")  # units that mean the same only on one machine
@@ -24,13 +26,13 @@ MACHINE_BOUND = ("ms", "us", "MB")  # units that mean the same only on one machi
 class Regression(NamedTuple):
     """A figure that got worse: old and new value, the limit that it broke, and why in words."""
 
-    figure: Figure
+    figure: Number
     new: float
     limit: float
     why: str
 
 
-def limit(figure: Figure) -> float:
+def limit(figure: Number) -> float:
     """The worst value that still passes."""
     slack = abs(figure.value) * (figure.tolerance or 0.0) + LEAST.get(figure.unit, 0.0)
     return figure.value + slack if figure.better == "lower" else figure.value - slack

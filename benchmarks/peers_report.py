@@ -9,14 +9,14 @@ from itertools import count
 from adapters import Peer
 from comparison import Result
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure as Canvas
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
-from results import Figure
 from rich.table import Table
 from torch import Tensor
 from work import Work
 
+from torch_ecc.paper.result import Number
 from torch_ecc.plots.style import new_figure, styled
 
 YARDSTICK = "OpenCV ECC, fastest fair"
@@ -64,24 +64,24 @@ def _degrees(bound: Tensor) -> Tensor:
     return bound * bound.new_tensor((1.0, 1.0, math.degrees(1.0)))
 
 
-def figures(work: str, results: Mapping[str, Result], peers: Mapping[str, Peer]) -> Iterator[Figure]:
+def figures(work: str, results: Mapping[str, Result], peers: Mapping[str, Peer]) -> Iterator[Number]:
     """Ours with a tolerance, the peers' to be read; so are times, of which the multiple of OpenCV's is what is held."""
     for name, result in results.items():
         mine, key = peers[name].family == "torch_ecc", f"{work} / {name} /"
         exact, timed, never = (EXACT, TIMED, 0.0) if mine else (None, None, None)
-        yield Figure(f"{key} time", result.ms()[1], "ms")
+        yield Number(f"{key} time", result.ms()[1], "ms")
         if mine and YARDSTICK in results:
-            yield Figure(
+            yield Number(
                 f"{key} time over OpenCV's", result.cpu_ms() / results[YARDSTICK].cpu_ms(), "x", "lower", timed
             )
         px, deg = result.rms()
-        yield Figure(f"{key} rms", px, "px", "lower", exact)
-        yield Figure(f"{key} rms theta", deg, "deg", "lower", exact)
-        yield Figure(f"{key} largest", result.largest()[0], "px", "lower", exact)
-        yield Figure(f"{key} lost", float(result.lost), "frames", "lower", never)
+        yield Number(f"{key} rms", px, "px", "lower", exact)
+        yield Number(f"{key} rms theta", deg, "deg", "lower", exact)
+        yield Number(f"{key} largest", result.largest()[0], "px", "lower", exact)
+        yield Number(f"{key} lost", float(result.lost), "frames", "lower", never)
 
 
-def draw(works: Mapping[str, Work], found: Mapping[str, Mapping[str, Result]], peers: Mapping[str, Peer]) -> Canvas:
+def draw(works: Mapping[str, Work], found: Mapping[str, Mapping[str, Result]], peers: Mapping[str, Peer]) -> Figure:
     """Time against error, one panel per work, both axes logarithmic; the bound is the dashed line."""
     looks = _looks(peers)
     columns = min(len(works), 4)

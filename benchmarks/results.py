@@ -10,30 +10,19 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch_ecc.paper.result import environment
+from torch_ecc.paper.result import Number, environment
 
 PEERS = ("opencv-python-headless", "pystackreg", "SimpleITK")
-
-
-class Figure(NamedTuple):
-    """One number. ``better``: "lower" or "higher". ``tolerance``: the share by which a later one may be worse; None if
-    it is only there to be read, as a peer's."""
-
-    name: str
-    value: float
-    unit: str
-    better: str = "lower"
-    tolerance: float | None = None
 
 
 class Result(NamedTuple):
     """Figures by name, and what they depend on."""
 
     about: dict[str, str]
-    figures: dict[str, Figure]
+    figures: dict[str, Number]
 
 
-def save(path: Path, figures: Iterable[Figure], **about: str) -> None:
+def save(path: Path, figures: Iterable[Number], **about: str) -> None:
     """Write a result: four digits, null for a number that is not finite, and nothing that is the default."""
     load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
     facts = environment() | _peers() | {"load": load} | about
@@ -46,7 +35,7 @@ def load(path: Path) -> Result:
     """Read what ``save`` wrote. ValueError for a file that is no result."""
     try:
         document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        figures = [Figure(**row) for row in document["figures"]]
+        figures = [Number(**row) for row in document["figures"]]
         about = dict(document["about"])
     except (KeyError, TypeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path}: expected a benchmark's result (about, figures), got {error!r}") from error
@@ -54,9 +43,9 @@ def load(path: Path) -> Result:
     return Result(about, {f.name: f if f.value is not None else f._replace(value=nan) for f in figures})
 
 
-def _row(figure: Figure) -> dict[str, Any]:
+def _row(figure: Number) -> dict[str, Any]:
     value = float(f"{figure.value:.4g}") if math.isfinite(figure.value) else None
-    default = Figure._field_defaults
+    default = Number._field_defaults
     return {k: v for k, v in figure._replace(value=value)._asdict().items() if k not in default or v != default[k]}
 
 

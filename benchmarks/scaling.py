@@ -19,13 +19,14 @@ from pathlib import Path
 import click
 import numpy as np
 import torch
-from results import Figure, save
+from results import save
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
 from torch_ecc import Tracker
-from torch_ecc.paper.accuracy import Harmonic
+from torch_ecc.paper.result import Number
+from torch_ecc.paper.scheme import Harmonic
 from torch_ecc.sim import Camera, PlaneWaves
 
 console = Console(width=110)
@@ -41,7 +42,7 @@ FRAME_SIZES = ((240, 320), (480, 640), (960, 1280), (1920, 2560))
 def stack(size: tuple[int, int] = (480, 640), frames: int = FRAMES) -> Tensor:
     """Frames (F, H, W) of small motion with noise of 2 grey levels."""
     camera = Camera(size=size, noise_sigma=2.0)
-    return camera.capture(SCENE, Harmonic(10.0, 2.0, 40).path(camera)[:frames])[:, 0]
+    return camera.capture(SCENE, Harmonic(10.0, 2.0, 40).closed(size)[:frames])[:, 0]
 
 
 def spread(count: int, size: int, frame: tuple[int, int]) -> Tensor:
@@ -104,7 +105,7 @@ def show(title: str, header: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -
     console.print(table)
 
 
-def over_templates(limit: float) -> list[Figure]:
+def over_templates(limit: float) -> list[Number]:
     """1 to 4,096 templates of 121 px in one frame, so far from its border that none comes near it and takes longer."""
     frames = stack()
     runs = within(limit, COUNTS, lambda n: (Tracker(frames[0], spread(n, 121 + 40, (480, 640)), 121), frames))
@@ -116,14 +117,14 @@ def over_templates(limit: float) -> list[Figure]:
     linear = slope(large, large.values()) if len(large) > 1 else math.nan
     console.print(f"slope from {min(large)} templates on: {linear:.2f}; peak while preparing {peak_mb():,.0f} MB\n")
     return [
-        Figure("one template of 121 px", 1e3 * found[1], "ms", "lower", 0.5),
-        Figure("per template of many", 1e3 * found[most] / most, "ms", "lower", 0.5),
-        Figure("slope over templates", linear, "", "lower", 0.15),
-        Figure("memory per template of 121 px", kept[most] / most, "MB", "lower", 0.1),
+        Number("one template of 121 px", 1e3 * found[1], "ms", "lower", 0.5),
+        Number("per template of many", 1e3 * found[most] / most, "ms", "lower", 0.5),
+        Number("slope over templates", linear, "", "lower", 0.15),
+        Number("memory per template of 121 px", kept[most] / most, "MB", "lower", 0.1),
     ]
 
 
-def over_pixels(limit: float) -> list[Figure]:
+def over_pixels(limit: float) -> list[Number]:
     """Templates of 31 to 501 px, 4 of each."""
     frame = (720, 960)
     frames = stack(frame)
@@ -134,10 +135,10 @@ def over_pixels(limit: float) -> list[Figure]:
     large = {n * n: s for n, s in found.items() if n >= 91}
     linear = slope(large, large.values())
     console.print(f"slope over pixels from 91 x 91 on: {linear:.2f}\n")
-    return [Figure("slope over pixels", linear, "", "lower", 0.15)]
+    return [Number("slope over pixels", linear, "", "lower", 0.15)]
 
 
-def over_frames(limit: float) -> list[Figure]:
+def over_frames(limit: float) -> list[Number]:
     """One template in frames of 320 x 240 to 2560 x 1920."""
     frames = {h * w: stack((h, w)) for h, w in FRAME_SIZES}
     runs = within(
@@ -148,10 +149,10 @@ def over_frames(limit: float) -> list[Figure]:
     show("Frame sizes, one template", ("frame, px", "ms"), [(shapes[n], f"{1e3 * s:.2f}") for n, s in found.items()])
     added = 1e3 * (max(found.values()) - min(found.values())) / (max(found) - min(found)) * 1e6
     console.print(f"{added:.2f} ms more per million pixels of frame\n")
-    return [Figure("per million pixels of frame", added, "ms", "lower", 0.5)]
+    return [Number("per million pixels of frame", added, "ms", "lower", 0.5)]
 
 
-def over_threads() -> list[Figure]:
+def over_threads() -> list[Number]:
     """64 templates on 1, 2, 4, ... threads."""
     before, frames, found = torch.get_num_threads(), stack(), {}
     cores = torch.multiprocessing.cpu_count()
@@ -162,10 +163,10 @@ def over_threads() -> list[Figure]:
     rows = [(str(n), f"{1e3 * s:.1f}", f"{64 / s:,.0f}", f"{found[1] / s:.2f}") for n, s in found.items()]
     show("Threads, 64 templates", ("threads", "ms per frame", "templates per s", "faster by"), rows)
     most = max(found)
-    return [Figure(f"64 templates, {n} threads", 64 / found[n], "1/s", "higher", None) for n in {1, most}]
+    return [Number(f"64 templates, {n} threads", 64 / found[n], "1/s", "higher", None) for n in {1, most}]
 
 
-def over_time(frames: int = 5000) -> list[Figure]:
+def over_time(frames: int = 5000) -> list[Number]:
     """Memory over a long stream."""
     images = stack(frames=41)
     tracker = Tracker(images[0], [(320.0, 240.0)], 121)
@@ -177,7 +178,7 @@ def over_time(frames: int = 5000) -> list[Figure]:
     rate, grown = frames / (time.perf_counter() - begun), peak_mb() - before
     console.print(f"{frames:,} frames: peak memory {before:.1f} MB and {grown:.1f} more, {rate:.0f} frames/s")
     console.print()
-    return [Figure(f"memory growth over {frames} frames", grown, "MB", "lower", None)]
+    return [Number(f"memory growth over {frames} frames", grown, "MB", "lower", None)]
 
 
 @click.command()

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.pose import compose
-from torch_ecc.paper.accuracy import SIZE, Harmonic
-from torch_ecc.paper.bound import QUANTISATION, cramer_rao
+from torch_ecc.paper.bound import cramer_rao, rounding
+from torch_ecc.paper.scheme import SIZE, Harmonic
 from torch_ecc.sim import Camera, GradientLight, Pads, PlaneWaves, Scene, Sequence, placed
 
-STANDARD = Harmonic(20.0, 5.0, 40).path(Camera())  # eq. (11): up to 3.1 px in x and in y, 4.4 px together, per frame
-SMALL = Harmonic(5.0, 1.25, 40).path(Camera())  # up to 1.1 px per frame
+STANDARD = Harmonic(20.0, 5.0, 40).closed()  # eq. (11): up to 3.1 px in x and in y, 4.4 px together, per frame
+SMALL = Harmonic(5.0, 1.25, 40).closed()  # up to 1.1 px per frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Simulated:
         """The frames. The bound counts the noise twice: the template is as noisy."""
         sequence = Sequence(self.scene, self.path, self.camera, seed)
         center, frames = self.path[:1, :2], torch.cat(list(sequence.batches()))
-        bound = cramer_rao(self.scene, (SIZE, SIZE), 2 * (self.camera.noise_sigma**2 + QUANTISATION))
+        bound = cramer_rao(self.scene, (SIZE, SIZE), 2 * (self.camera.noise_sigma**2 + rounding(8)))
         x, y = center[0].tolist()
         return Work(name, self.title, frames, (x, y), SIZE, sequence.truth(center)[1:, 0], bound)
 

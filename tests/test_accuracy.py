@@ -7,19 +7,21 @@ import math
 import pytest
 import torch
 
-from torch_ecc import Status, align, prepare
+from torch_ecc import Status, align
 from torch_ecc.core.pose import inverse, transform
 from torch_ecc.core.reference import ALIASING
 from torch_ecc.core.verdict import interpolation_error
-from torch_ecc.paper.accuracy import Draws, Harmonic, least, scatter, track_path, under_light
 from torch_ecc.paper.bound import cramer_rao, oracle, rounding
+from torch_ecc.paper.methods import prepared
+from torch_ecc.paper.scatter import Draws, least, scatter
+from torch_ecc.paper.scheme import Harmonic
+from torch_ecc.paper.sequences import track_path, under_light
 from torch_ecc.sim import Sequence
 from torch_ecc.sim.camera.camera import Camera
 from torch_ecc.sim.camera.light import GradientLight, SpotLight
 from torch_ecc.sim.scene.pads import Pads
 from torch_ecc.sim.scene.waves import PlaneWaves
 
-MASK = torch.nn.functional.pad(torch.ones(121, 121), (8, 8, 8, 8)).bool()
 SCENE = PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0)
 SCENES = {"waves": SCENE, "pads": Pads.wafer()}
 
@@ -100,7 +102,7 @@ def test_the_covariance_knows_the_samplers_own_error(interpolation):
     poses = torch.stack((110 + phases, 110 + phases.flip(0), 0 * phases), -1).double()
     frames = SCENE.render(poses, (221, 221)).float()
     middle = torch.tensor([[110.0, 110.0, 0.0]], dtype=torch.float64)
-    reference = prepare(SCENE.render(middle, (221, 221))[:, :, 42:179, 42:179].float(), mask=MASK)
+    reference = prepared(SCENE.render(middle, (221, 221))[:, :, 42:179, 42:179].float(), {})
     rows = [align(reference, f[None], p[None], interpolation=interpolation) for f, p in zip(frames, poses, strict=True)]
     error = torch.cat([row.pose for row in rows])[:, :2] - poses[:, :2]
     sigma = torch.cat([row.sigma for row in rows])[:, :2]
@@ -110,7 +112,7 @@ def test_the_covariance_knows_the_samplers_own_error(interpolation):
 def test_the_samplers_error_adds_up_only_where_pixels_lie_alike():
     poses = torch.tensor([[110.0, 110.0, angle] for angle in (0.0, math.tau / 4, math.pi, 0.3)], dtype=torch.float64)
     frame = SCENE.render(poses[:1], (221, 221)).float()
-    reference = prepare(frame[:, :, 42:179, 42:179].expand(4, -1, -1, -1), mask=MASK)
+    reference = prepared(frame[:, :, 42:179, 42:179].expand(4, -1, -1, -1), {})
     variance = interpolation_error(reference, poses, "bspline3")[:, 0, 0]
     assert variance[:3] / variance[0] == pytest.approx(1.0, abs=1e-6)
     assert variance[3] < 1e-3 * variance[0]
@@ -119,7 +121,7 @@ def test_the_samplers_error_adds_up_only_where_pixels_lie_alike():
 def test_noise_free_sequence_of_equation_11():
     """20 px and 5 deg, 8 bit: at most 0.001 px and 0.001 deg rms, 0.003 at most."""
     camera = Camera(size=(221, 221))
-    run = track_path(Sequence(SCENE, Harmonic(20.0, 5.0, 40).path(camera), camera))
+    run = track_path(Sequence(SCENE, Harmonic(20.0, 5.0, 40).closed(camera.size), camera))
     assert (run.status == Status.CONVERGED).all()
     assert max(run.rms) < 0.001
     assert max(run.largest) < 0.003

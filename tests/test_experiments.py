@@ -7,9 +7,11 @@ import math
 import pytest
 import torch
 
-from torch_ecc.core.pose import compose, rotation
+from torch_ecc.core.pose import compose, rotation, transform
 from torch_ecc.paper import fig3, fig4, robustness, scheme, table1, trials
-from torch_ecc.paper.methods import METHODS, errors, largest
+from torch_ecc.paper.bound import cramer_rao
+from torch_ecc.paper.errors import box, by_unit, errors, largest
+from torch_ecc.paper.methods import COMPARED, METHODS
 from torch_ecc.paper.result import counter
 from torch_ecc.sim import Camera, PlaneWaves, Sequence
 
@@ -28,7 +30,7 @@ def test_counter_counts_to_its_total():
 
 def test_errors_are_in_px_and_degrees():
     pose = torch.tensor([[1.0, -2.0, math.radians(3)], [0.5, 0.1, 0.0]], dtype=torch.float64)
-    assert largest(errors(pose, torch.zeros_like(pose))) == pytest.approx((2.0, 3.0))
+    assert by_unit(largest(errors(pose, torch.zeros_like(pose)))) == pytest.approx((2.0, 3.0))
 
 
 def test_motion_has_the_papers_amplitudes():
@@ -59,18 +61,16 @@ def test_template_is_cut_around_its_start(size):
     assert (centre - cut.start[:2]).abs().max() <= (0.5 if size % 2 == 0 else 0)
 
 
-def test_a_scene_in_the_templates_own_coordinates():
-    """The same grey levels at the same places, and a gradient along the template's axes."""
+def test_the_bound_of_a_template_that_lies_turned_is_along_its_own_axes():
+    """Of gradients by autodiff of the scene as the template sees it."""
     scene, path = PlaneWaves.random(seed=3), scheme.TEXT.path()[7:8]
-    cut = scheme.cut_first(path)
-    turned = cut.seen(scene)
-    points = torch.tensor([[3.0, -2.0], [-7.5, 11.25]], dtype=torch.float64)
-    frame = scene.render(path, scheme.FRAME)[0, 0]
-    at = (cut.start[:2] + points[:1]).long()[0]
-    assert abs(float(turned.value(points)[0]) - float(frame[at[1], at[0]])) < 1e-2
-    step = 1e-3 * torch.eye(2, dtype=torch.float64)
-    slopes = torch.stack([(turned.value(points + d) - turned.value(points - d)) / 2e-3 for d in step], -1)
-    assert torch.allclose(turned.gradient(points), slopes, atol=1e-4)
+    own = scheme.cut_first(path).place()
+    y, x = torch.meshgrid(*(torch.arange(21) - 10.0,) * 2, indexing="ij")
+    points = torch.stack((x.flatten(), y.flatten()), -1).double()
+    moved = torch.func.jacfwd(lambda p: scene.value(transform(own, transform(p, points))))(torch.zeros(3).double())
+    seen = torch.stack((torch.ones(len(points)).double(), scene.value(transform(own, points))), 1)
+    J = moved - seen @ torch.linalg.lstsq(seen, moved).solution
+    assert torch.allclose(cramer_rao(scene, (21, 21), 4.0, own), 2 * torch.linalg.inv(J.mT @ J).diagonal().sqrt())
 
 
 def test_a_scene_kept_is_the_scene_rendered():
@@ -111,7 +111,7 @@ def test_uneven_light_short(spread):
 def test_even_light_short():
     found = fig3.sequence_errors(scheme.TEXT.path()[38:41], nothing)
     for name, error in found["without UI"].items():
-        px, deg = largest(error)
+        px, deg = by_unit(largest(error))
         assert px < fig3.EVEN_LIMIT[0], name
         assert deg < fig3.EVEN_LIMIT[1], name
 
@@ -129,7 +129,7 @@ def test_ratio_is_one_for_errors_at_the_bound_along_the_templates_axes():
 
 def test_quartiles_are_the_box():
     error = torch.linspace(-3, 1, 401).double()[:, None].expand(-1, 3)
-    assert torch.allclose(fig4.quartiles(error), torch.full((3,), 2.0).double())
+    assert torch.allclose(box(error), torch.full((3,), 2.0).double())
 
 
 def test_noise_short():
@@ -138,14 +138,14 @@ def test_noise_short():
     found = fig4.trials(path, torch.tensor([20, 100]), scheme.cut_reflected(), nothing)
     assert list(found) == ["0.001", "0.002", "0.005"]
     for noisy in found.values():
-        over = {name: noisy.over(name) for name in fig4.USED}
+        over = {name: noisy.over(name) for name in COMPARED}
         assert all(0.6 < value < 1.5 for value in over.values()), over
         assert max(over.values()) - min(over.values()) < 0.1, over
     assert torch.allclose(found["0.002"].bound / found["0.001"].bound, torch.tensor(2.0).sqrt().double(), rtol=2e-3)
 
 
 def times(once: float, each: float) -> table1.Times:
-    return table1.Times([once] * 4, {name: [each] * 4 for name in table1.SAMPLERS}, [1.0] * 4, [4, 6])
+    return table1.Times({table1.T_PRE: [once] * 4, table1.T_IT: [each] * 4}, [4, 6])
 
 
 def test_crossover_is_where_both_formulas_meet():
@@ -163,18 +163,20 @@ def test_timing_short():
     found = table1.measure(2, 2, lambda done, total: None)
     assert list(found) == list(METHODS)
     for name, t in found.items():
-        assert len(t.precomputation) == len(t.frame) == len(t.iterations) == 2
-        assert min(*t.precomputation, *t.frame, *t.iteration["bspline3"]) > 0, name
+        assert list(t.ms) == list(table1.WORKS)
+        assert {len(t.iterations), *map(len, t.ms.values())} == {2}
+        assert min(map(min, t.ms.values())) > 0, name
         assert 1 < max(t.iterations) <= 15, name
 
 
 def test_pairs_jump_and_turn_as_asked_at_places_that_stay_the_same():
-    near, far = trials.pairs(9, 2.0, 1.0), trials.pairs(9, 30.0, 0.0)
-    assert torch.equal(near.first, far.first)
-    assert torch.allclose((near.truth - trials.MIDDLE)[:, :2].norm(dim=1), torch.tensor(2.0).double())
-    assert torch.allclose(near.truth[:, 2].abs().rad2deg(), torch.tensor(1.0).double())
-    place = compose(trials.MIDDLE * torch.tensor((-1.0, -1.0, 0.0)), near.first)
-    assert torch.allclose(compose(near.truth, place), near.second)
+    (near, second), (far, _) = trials.pairs(9, 2.0, 1.0), trials.pairs(9, 30.0, 0.0)
+    assert torch.equal(near.pose, far.pose)
+    truth = near.truth(second)
+    assert torch.allclose((truth - trials.MIDDLE)[:, :2].norm(dim=1), torch.tensor(2.0).double())
+    assert torch.allclose(truth[:, 2].abs().rad2deg(), torch.tensor(1.0).double())
+    place = compose(trials.MIDDLE * torch.tensor((-1.0, -1.0, 0.0)), near.pose)
+    assert torch.allclose(compose(truth, place), second)
 
 
 def test_corner_error_bounds_what_moves_at_the_corner():
@@ -213,7 +215,7 @@ def test_sweep_short():
     the pyramid reaches farther."""
     changes = [trials.Change(jump=jump, turn=0, size=61) for jump in (0.5, 12, 90)]
     found = trials.sweep(changes, 4, nothing, trackers=True)
-    for name in (*trials.METHODS_USED, *trials.TRACKERS):
+    for name in (*COMPARED, *trials.TRACKERS):
         assert found.rate[name][0] == 1, name
         assert found.rate[name][2] == ("search" in name), name
         assert found.error[name][0] < 0.05, name

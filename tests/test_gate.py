@@ -12,26 +12,28 @@ from click.testing import CliRunner
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import gate
-from results import Figure, load, save
+from results import load, save
 
-RMS = Figure("clean / rms", 0.01, "px", "lower", 0.1)
-RATE = Figure("poses per second", 100.0, "1/s", "higher", 0.2)
-TIME = Figure("clean / time", 2.0, "ms", "lower", 0.5)
-PEER = Figure("peer / rms", 0.01, "px")
+from torch_ecc.paper.result import Number
+
+RMS = Number("clean / rms", 0.01, "px", "lower", 0.1)
+RATE = Number("poses per second", 100.0, "1/s", "higher", 0.2)
+TIME = Number("clean / time", 2.0, "ms", "lower", 0.5)
+PEER = Number("peer / rms", 0.01, "px")
 
 
-def written(path: Path, *figures: Figure, **about: str) -> Path:
+def written(path: Path, *figures: Number, **about: str) -> Path:
     save(path, figures, **about)
     return path
 
 
-def exit_code(tmp_path: Path, old: tuple[Figure, ...], new: tuple[Figure, ...], **about: str) -> int:
+def exit_code(tmp_path: Path, old: tuple[Number, ...], new: tuple[Number, ...], **about: str) -> int:
     files = [written(tmp_path / "old.json", *old), written(tmp_path / "new.json", *new, **about)]
     return CliRunner().invoke(gate.main, [str(f) for f in files]).exit_code
 
 
 def test_a_result_comes_back_as_it_was_saved(tmp_path):
-    lost = Figure("lost / rms", math.nan, "px", "lower", 0.1)
+    lost = Number("lost / rms", math.nan, "px", "lower", 0.1)
     result = load(written(tmp_path / "r.json", RMS, RATE, PEER, lost, rounds="3"))
     assert [result.figures[f.name] for f in (RMS, RATE, PEER)] == [RMS, RATE, PEER]
     assert math.isnan(result.figures[lost.name].value)

@@ -7,10 +7,11 @@ import math
 import pytest
 import torch
 
-from torch_ecc import align, prepare
+from torch_ecc import align
 from torch_ecc.core.pose import transform
 from torch_ecc.core.reference import MARGIN
 from torch_ecc.core.sampling import gradients
+from torch_ecc.paper.methods import prepared
 from torch_ecc.paper.ref34 import Ref34, jacobian, pixels
 from torch_ecc.sim import PlaneWaves
 
@@ -41,9 +42,7 @@ def test_agrees_with_ssd(theta):
     truth = torch.tensor([[90.3, 80.6, theta]], dtype=torch.float64)
     frame, start = SCENE.render(truth, (160, 180)), truth + torch.tensor([[0.4, -0.5, 0.01]])
     found = Ref34(template(), start).track(frame)
-    mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-    mask[MARGIN:-MARGIN, MARGIN:-MARGIN] = True
-    ssd = align(prepare(template(), criterion="ssd", mask=mask), frame, start).pose
+    ssd = align(prepared(template(), {"criterion": "ssd"}), frame, start).pose
     assert (found - ssd).abs().max() < 1e-3
     assert (found - truth)[0, :2].abs().max() < 3e-3
     assert abs(float(found[0, 2]) - theta) < math.radians(0.005)

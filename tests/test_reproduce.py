@@ -15,20 +15,20 @@ from matplotlib.figure import Figure
 from torch_ecc.cli import app, main
 from torch_ecc.paper import reproduce
 from torch_ecc.paper.report import write_report
-from torch_ecc.paper.result import Outcome, Picture, Record, Table, load_records
+from torch_ecc.paper.result import Experiment, Number, Picture, Table, load_records
 
 QUICK, FULL = ({"quick": quick, "seconds": 2.0, "cpu_seconds": 1.0} for quick in (True, False))
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def outcome(name: str = "fig2", pictures: tuple[str, ...] = ("curve",), remark: str = "All is well.") -> Outcome:
+def outcome(name: str = "fig2", pictures: tuple[str, ...] = ("curve",), remark: str = "All is well.") -> Experiment:
     records = [
-        Record("kept", 0.5, "px", tolerance=1.0, paper=0.7),
-        Record("missed", 2.0, "px", tolerance=1.0),
-        Record("just told", float("inf"), "1", better="higher"),
+        Number("kept", 0.5, "px", tolerance=1.0, paper=0.7),
+        Number("missed", 2.0, "px", tolerance=1.0),
+        Number("just told", float("inf"), "1", better="higher"),
     ]
     drawn = [Picture(p, Figure(figsize=(1, 1)), f"caption of {p}") for p in pictures]
-    return Outcome(name, f"Title of {name}", drawn, [Table("Rows", ("a", "b"), [("1", "2")])], records, [remark], 7)
+    return Experiment(name, f"Title of {name}", drawn, [Table("Rows", ("a", "b"), [("1", "2")])], records, [remark], 7)
 
 
 class Page(HTMLParser):
@@ -105,7 +105,7 @@ def test_report_is_one_self_contained_page(tmp_path):
 def test_report_escapes_every_text(tmp_path):
     nasty = "<script>alert('x')</script> & <b>\"bold\"</b>"
     o = outcome(remark=nasty)._replace(title=nasty, tables=[Table(nasty, (nasty,), [(nasty,)], nasty)])
-    o = o._replace(records=[Record(nasty, 1.0, "<i>", tolerance=2.0), Record(nasty, 1.0, "<i>")])
+    o = o._replace(records=[Number(nasty, 1.0, "<i>", tolerance=2.0), Number(nasty, 1.0, "<i>")])
     o = o._replace(pictures=[o.pictures[0]._replace(caption=nasty)])
     reproduce.save(o, tmp_path / "fig2", QUICK)
     write_report(tmp_path / "report.html", [tmp_path / "fig2" / "records.json"])

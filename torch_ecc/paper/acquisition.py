@@ -7,57 +7,51 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Status, Track
+from torch_ecc.paper.errors import valid
+from torch_ecc.paper.result import Advance, Table, cells
+from torch_ecc.paper.scheme import SIZE
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Motion
+from torch_ecc.sim import Floor, Microscope, Sensors, Sequence, Stage, StageMotion, StageSettings, micrograph
 from torch_ecc.sim.camera.light import Light
-from torch_ecc.sim.camera.sequence import Sequence
-from torch_ecc.sim.scene.micrograph import micrograph
 from torch_ecc.sim.scene.window import Window
-from torch_ecc.sim.stage.microscope import Microscope
-from torch_ecc.sim.stage.sensors import Sensors
-from torch_ecc.sim.stage.stage import Stage, StageMotion, StageSettings
-from torch_ecc.sim.stage.vibration import Floor
 from torch_ecc.track.tracker import Tracker
 
-SIZE = 121  # px, the paper's template
 AROUND = 16  # px drawn around it: all that a tracker reads
 COMMAND_HZ = 1000.0
 QUIET = Floor(speed_um_s=0.78)  # VC-G: an isolated table (Amick et al., SPIE 5933, 2005)
-# Of the microscope: a stiff column on that table, and a strobe (2 ms of light would smear 0.05 um at most).
-ON_TABLE: Mapping[str, Any] = {"floor": QUIET, "column_hz": 90.0, "exposure_s": 0.0}
+NOISE = 2.0  # of the camera, grey levels
 CAMERA_START_S = 0.2137  # of the stage's clock; the sensors start with the stage
-METHODS: Mapping[str, Mapping[str, Any]] = {"ECC": {}}
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Settings: microscope, light, ``gain`` and ``noise`` of the camera in grey levels, and the trackers by name."""
+    """Settings: microscope, light, ``gain`` of the camera, and the trackers by name."""
 
-    microscope: Microscope = field(default_factory=lambda: Microscope(**ON_TABLE))
+    microscope: Microscope
     light: Light | None = None
     gain: float = 1.0
-    noise: float = 2.0
-    methods: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: METHODS)
+    methods: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"ECC": {}})
     seed: int = 0
 
 
 class Acquisition(NamedTuple):
     """Both records as ``Motion`` in um, um, rad: one per tracker, NaN where it was lost, and the sensors'.
 
-    Each counts from its own zero; ``zeroed`` brings them to zero at rest. ``sigma`` (F, 3) um, um, rad as each tracker
-    gives it; ``truth`` is what the template's image really did, through the same calibration, ``motion`` what the stage
-    really did, on the sensors' clock, and ``offset_s`` the truth of the clocks. ``seconds`` each part took; ``first``
-    (H, W) is the first frame.
+    Each counts from its own zero; ``zeroed`` brings them to zero at rest. ``truth`` is what the template's image really
+    did, through the same calibration, ``motion`` what the stage really did, on the sensors' clock, and ``offset_s`` the
+    truth of the clocks. ``seconds`` each part took; ``first`` (H, W) is the first frame.
     """
 
     tracks: dict[str, Motion]
-    sigma: dict[str, Tensor]
     sensors: Motion
     truth: Motion
     motion: StageMotion
@@ -86,12 +80,42 @@ def acquire(command: Tensor, bench: Bench, tick: Callable[[], None]) -> Acquisit
     center = torch.tensor([_middle(film.camera.size)])
     truth = scale.to_physical(film.truth(center)[:, 0] - film.truth(center)[0, 0])
     offset = float(bench.microscope.times(motion, start_s=CAMERA_START_S)[0] - record.times_s[0])
-    motions, sigma = {}, {}
+    motions = {}
     for name, track in tracks.items():
         pose = scale.to_physical(track.displacement[:, 0])
         motions[name] = Motion(times, torch.where(Status.good(track.status), pose, torch.nan))
-        sigma[name] = scale.covariance(track.covariance[:, 0]).diagonal(dim1=-2, dim2=-1).sqrt()
-    return Acquisition(motions, sigma, read, Motion(times, truth), motion, offset, seconds, first)
+    return Acquisition(motions, read, Motion(times, truth), motion, offset, seconds, first)
+
+
+def simulated_once(simulate: Callable[[bool, Advance], T]) -> Callable[[bool, Advance], T]:
+    """``simulate(quick, advance)`` at the first call only; later ones get what that one returned."""
+    kept: dict[bool, T] = {}
+
+    @wraps(simulate)
+    def recall(quick: bool, advance: Advance) -> T:
+        if quick not in kept:
+            kept[quick] = simulate(quick, advance)
+        return kept[quick]
+
+    return recall
+
+
+def microscope(quick: bool, **options: Any) -> Microscope:
+    """A stiff column on that table, and a strobe (2 ms of light would smear 0.05 um at most).
+
+    ``quick``: it reads a smaller part of its sensor.
+    """
+    region = (240, 320) if quick else (480, 640)
+    return Microscope(region_px=region, floor=QUIET, column_hz=90.0, exposure_s=0.0, **options)
+
+
+def times(acquired: Mapping[str, Acquisition]) -> Table:
+    """Seconds of each part of every simulation, and of all."""
+    first = next(iter(acquired.values()))
+    rows = [(name, *cells((*a.seconds.values(), sum(a.seconds.values())), ".1f")) for name, a in acquired.items()]
+    frames, samples, (h, w) = len(first.truth.time_s), len(first.sensors.time_s), first.first.shape
+    title = f"Time in s: {frames} frames of {w}x{h} px and {samples} samples of three sensors"
+    return Table(title + (", each" if len(rows) > 1 else ""), ("", *first.seconds, "all"), rows)
 
 
 def tracker_of(first: Tensor, **options: Any) -> Tracker:
@@ -102,7 +126,7 @@ def tracker_of(first: Tensor, **options: Any) -> Tracker:
 def zeroed(motion: Motion, rest_s: float) -> Motion:
     """The record from the mean of its first ``rest_s`` s, in which the stage rests."""
     rest = motion.pose[motion.time_s < motion.time_s[0] + rest_s]
-    return Motion(motion.time_s, motion.pose - rest[rest.isfinite().all(1)].mean(0))
+    return Motion(motion.time_s, motion.pose - valid(rest).mean(0))
 
 
 def frames_of(command: Tensor, bench: Bench) -> int:
@@ -120,7 +144,7 @@ def _film(motion: StageMotion, bench: Bench) -> Sequence:
     """The lens' point-spread and the pixel's own width blur the analytic scene exactly, instead of its pixels."""
     microscope = bench.microscope
     spread = (microscope.camera().blur_sigma ** 2 + 1 / 12) ** 0.5
-    settings = {"light": bench.light, "gain": bench.gain, "noise_sigma": bench.noise}
+    settings = {"light": bench.light, "gain": bench.gain, "noise_sigma": NOISE}
     camera = microscope.camera(blur_sigma=0.0, **settings)
     side = SIZE + 2 * AROUND
     scene = Window(micrograph(sigma=spread), (side, side))

@@ -3,31 +3,22 @@ one that knows the scene."""
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
-from torch_ecc.core.pose import inverse, transform
+from torch_ecc.core.pose import inverse, rotation, transform
+from torch_ecc.sim import Scene
 from torch_ecc.sim.camera.sensor import WHITE
-from torch_ecc.sim.scene.scene import Scene
 
-QUANTISATION = 1 / 12  # variance of rounding to whole grey levels
 NUDGE = 1 / 64  # px: half the base of the difference quotients below
 SETTLED = 1e-6  # px: the last step of an oracle that has its answer
 STEPS = 30  # at most; it takes two or three from nearby
 
 
-class AnalyticScene(Protocol):
-    """A scene known exactly at every point, in template coordinates (..., 2) px."""
-
-    def value(self, points: Tensor) -> Tensor: ...
-
-    def gradient(self, points: Tensor) -> Tensor: ...
-
-
-def cramer_rao(scene: AnalyticScene, size: tuple[int, int], variance: float) -> Tensor:
+def cramer_rao(scene: Scene, size: tuple[int, int], variance: float, at: Tensor | None = None) -> Tensor:
     """Bound (3,) px, px, rad on the standard deviation of x, y, theta of a template (h, w) at the scene's origin.
+
+    ``at`` (3,): the template's own pose in the scene; the bound is along its axes.
 
     ``variance`` of the white noise in squared grey levels: the frame's, and the template's too where it is as noisy and
     drawn anew each time. Gain and offset are unknown, so the Jacobian counts only off {1, t}:
@@ -36,7 +27,9 @@ def cramer_rao(scene: AnalyticScene, size: tuple[int, int], variance: float) -> 
     h, w = size
     y, x = torch.meshgrid(torch.arange(h) - (h - 1) / 2, torch.arange(w) - (w - 1) / 2, indexing="ij")
     points = torch.stack((x.flatten(), y.flatten()), -1).double()
-    t, (gx, gy) = scene.value(points), scene.gradient(points).unbind(-1)
+    place = points.new_zeros(3) if at is None else at
+    there = transform(place, points)
+    t, (gx, gy) = scene.value(there), (scene.gradient(there) @ rotation(place[2])).unbind(-1)
     J = torch.stack((gx, gy, gx * points[:, 1] - gy * points[:, 0]), -1)
     span, _ = torch.linalg.qr(torch.stack((torch.ones_like(t), t), -1))
     J = J - span @ (span.mT @ J)
@@ -46,7 +39,7 @@ def cramer_rao(scene: AnalyticScene, size: tuple[int, int], variance: float) -> 
 
 def rounding(bits: int | None) -> float:
     """Variance of rounding to ``bits``, squared grey levels of 0..255; of None, no rounding, zero."""
-    return 0.0 if bits is None else QUANTISATION * (WHITE / (2**bits - 1)) ** 2
+    return 0.0 if bits is None else (WHITE / (2**bits - 1)) ** 2 / 12
 
 
 def oracle(scene: Scene, frame: Tensor, start: Tensor, size: tuple[int, int]) -> Tensor:

@@ -12,20 +12,21 @@ from torch import Tensor
 
 from torch_ecc.paper.acquisition import (
     COMMAND_HZ,
-    ON_TABLE,
     Acquisition,
     Bench,
     acquire,
     ease,
     frames_of,
+    microscope,
+    simulated_once,
     zeroed,
 )
-from torch_ecc.paper.result import Advance
+from torch_ecc.paper.errors import valid
+from torch_ecc.paper.result import Advance, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.curves import Circle, Ellipse, fit_circle, fit_ellipse, fit_line
 from torch_ecc.records.motion import Motion, nearest_errors
 from torch_ecc.records.synchrony import Alignment, Curve, align_records
-from torch_ecc.sim.stage.microscope import Microscope
 
 RADII = (8.0, 12.0)  # um, commanded
 ZOOM = 2.0  # 0.275 um per px
@@ -39,8 +40,8 @@ class Round(NamedTuple):
 
     ``dynamic`` and the residuals of ``joint`` (., 3) um, um, rad are errors by the paper's method, of the circular
     portion ``portion`` (.,) of the frames, and by the joint estimate. ``line_angle`` in rad is that of image against
-    stage by straight lines. ``known`` (3,) um, um, rad is the rms that is left with clocks and angle known exactly,
-    ``tracker``, ``lens`` and ``cds`` what the tracker, the vibration of the lens and the sensors have in it.
+    stage by straight lines. ``parts`` (3,) um, um, rad are the rms "known" that is left with clocks and angle known
+    exactly, and what the vibration of the "lens", the "tracker" and the sensors, "CDS", have in it.
     """
 
     radius: float
@@ -54,30 +55,16 @@ class Round(NamedTuple):
     line_angle: float
     circle: Circle
     ellipse: Ellipse
-    known: Tensor
-    tracker: Tensor
-    lens: Tensor
-    cds: Tensor
+    parts: dict[str, Tensor]
 
 
-_kept: dict[bool, list[Round]] = {}
-
-
+@simulated_once
 def rounds(quick: bool, advance: Advance) -> list[Round]:
     """Both circles; simulated at the first call only. ``quick``: twice as fast, and a smaller part of the sensor."""
-    if quick not in _kept:
-        region = (240, 320) if quick else (480, 640)
-        bench = Bench(microscope=Microscope(zoom=ZOOM, region_px=region, **ON_TABLE))
-        commands = [command(radius, 5.0 if quick else 10.0) for radius in RADII]
-        total, done = sum(frames_of(c, bench) for c in commands), 0
-
-        def tick() -> None:
-            nonlocal done
-            done += 1
-            advance(min(done, total), total)
-
-        _kept[quick] = [one_round(RADII[k], commands[k], replace(bench, seed=k), tick) for k in range(len(RADII))]
-    return _kept[quick]
+    bench = Bench(microscope=microscope(quick, zoom=ZOOM))
+    commands = [command(radius, 5.0 if quick else 10.0) for radius in RADII]
+    tick = counter(sum(frames_of(c, bench) for c in commands), advance)
+    return [one_round(RADII[k], commands[k], replace(bench, seed=k), tick) for k in range(len(RADII))]
 
 
 def command(radius: float, length_s: float) -> Tensor:
@@ -93,13 +80,17 @@ def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None
     acquired = acquire(path, bench, tick)
     rest = REST_S * len(path) / COMMAND_HZ
     track, sensors = zeroed(acquired.tracks["ECC"], rest), zeroed(acquired.sensors, rest)
-    visual, sensed = circular(track), circular(sensors)
-    joint = align_records(track, sensors)
+    visual, sensed = portions(track)[1], portions(sensors)[1]
     points = sensors.pose[sensed, :2]
     turn = Calibration(1.0, bench.microscope.axis_angle)
     turned, image = (turn.to_physical(m.pose) for m in (acquired.tracks["ECC"], acquired.truth))
     at = acquired.truth.time_s + acquired.offset_s
-    real = acquired.motion.at(at)
+    differences = {
+        "known": turned - Curve(acquired.sensors)(at)[0],
+        "lens": image - acquired.motion.at(at),
+        "tracker": turned - image,
+        "CDS": acquired.sensors.pose - acquired.motion.at(acquired.sensors.time_s),
+    }
     return Round(
         radius,
         bench.microscope.axis_angle,
@@ -108,31 +99,31 @@ def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None
         sensors,
         visual,
         nearest_errors(_cut(track, visual), _cut(sensors, sensed)),
-        joint,
+        align_records(track, sensors),
         line_angle(track, sensors),
         fit_circle(points),
         fit_ellipse(points),
-        _scatter(turned - Curve(acquired.sensors)(at)[0]),
-        _scatter(turned - image),
-        _scatter(image - real),
-        _scatter(acquired.sensors.pose - acquired.motion.at(acquired.sensors.time_s)),
+        {name: valid(difference).std(0) for name, difference in differences.items()},
     )
 
 
-def circular(motion: Motion) -> Tensor:
-    """The circular portion as the record itself shows it: between the first and the last sample near the rim, (T,)."""
+def portions(motion: Motion) -> tuple[Tensor, Tensor, Tensor]:
+    """The straight way out, the circular portion and the way back, (T,) each, as the record itself shows them.
+
+    The circle is what lies between the first and the last sample near the rim.
+    """
     distance = motion.pose[:, :2].norm(dim=1).nan_to_num()
-    rim = (distance > ON_RIM * distance.max()).nonzero()[:, 0]
-    index = torch.arange(len(distance))
-    portion: Tensor = (index >= rim[0]) & (index <= rim[-1])
-    return portion
+    on_rim, low, high = (share * distance.max() for share in (ON_RIM, *ON_LINE))
+    rim, index = (distance > on_rim).nonzero()[:, 0], torch.arange(len(distance))
+    line = (distance > low) & (distance < high)
+    return line & (index < rim[0]), (index >= rim[0]) & (index <= rim[-1]), line & (index > rim[-1])
 
 
 def line_angle(track: Motion, sensors: Motion) -> float:
     """Angle in rad from the image's axes to the stage's by straight lines, mean of the ways out and back."""
     angles = []
-    for outward in (True, False):
-        image, stage = (fit_line(_line(motion, outward)).angle for motion in (track, sensors))
+    for way in (0, 2):
+        image, stage = (fit_line(motion.pose[portions(motion)[way], :2]).angle for motion in (track, sensors))
         angles.append(math.remainder(image - stage, math.tau))
     return sum(angles) / 2
 
@@ -143,21 +134,5 @@ def common_angle(found: list[Round]) -> float:
     return sum(w * r.line_angle for w, r in zip(weights, found, strict=True)) / sum(weights)
 
 
-def _line(motion: Motion, outward: bool) -> Tensor:
-    """Points (N, 2) of the straight portion before, or after, the circle."""
-    distance = motion.pose[:, :2].norm(dim=1).nan_to_num()
-    rim = circular(motion).nonzero()[:, 0]
-    index = torch.arange(len(distance))
-    side = index < rim[0] if outward else index > rim[-1]
-    low, high = (share * distance.max() for share in ON_LINE)
-    return motion.pose[side & (distance > low) & (distance < high), :2]
-
-
 def _cut(motion: Motion, rows: Tensor) -> Motion:
     return Motion(motion.time_s[rows], motion.pose[rows])
-
-
-def _scatter(errors: Tensor) -> Tensor:
-    """Standard deviations (3,) of errors (T, 3), lost frames left out."""
-    spread: Tensor = errors[errors.isfinite().all(1)].std(0)
-    return spread

@@ -5,9 +5,11 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
-from torch_ecc.paper.steps import LAMP, METHODS, Staircase, staircase
-from torch_ecc.plots.style import new_figure, styled
+from torch_ecc.paper.drawing import label_steps
+from torch_ecc.paper.errors import largest
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture
+from torch_ecc.paper.steps import LAMP, METHODS, staircase, step_table
+from torch_ecc.plots.style import new_figure
 
 STYLES = {"ECC": ("o-", "#0072b2"), "ECC, gain": ("s--", "#56b4e9"), "SSD": ("^-", "#d55e00")}
 REMARKS = (
@@ -19,40 +21,22 @@ REMARKS = (
 )
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Mean of each step minus that of the CDS, drawn as the paper's Fig. 11. ``quick``: dwells of 0.3 s."""
     found = staircase(quick, advance)
-    errors = {name: absolute(found, name) for name in METHODS}
-    with styled():
-        figure = draw(errors, found.levels_deg[1:])
+    errors = {name: (found.mean_deg(name) - found.mean_deg("CDS"))[1:] for name in METHODS}
     caption = (
         "Absolute measurement errors of theta, the average of each step minus that of the CDS, under uneven light."
     )
-    records = [
-        Record(f"fig11 {name}: largest absolute error", float(e.abs().max()), "deg") for name, e in errors.items()
-    ]
+    records = [Number(f"fig11 {name}: largest absolute error", float(largest(e)), "deg") for name, e in errors.items()]
     for name in ("ECC", "ECC, gain"):
         worse = float((errors[name].abs() >= errors["SSD"].abs()).sum())
         limit = 0.0 if name == "ECC" else None
-        records.append(Record(f"fig11 steps at which {name} is not better than SSD", worse, "", tolerance=limit))
-    title = "Fig. 11: absolute errors"
-    tables = [_table(found, errors)]
-    return Outcome("fig11", title, [Picture("fig11", figure, caption)], tables, records, REMARKS)
-
-
-def absolute(found: Staircase, name: str) -> Tensor:
-    """Absolute errors (K - 1,) of theta in deg, of all steps but the first."""
-    errors: Tensor = found.absolute_errors(name)[1:, 2].rad2deg()
-    return errors
-
-
-def _table(found: Staircase, errors: dict[str, Tensor]) -> Table:
-    noise = found.dwells["ECC"].standard_error[1:, 2].rad2deg().tolist()
-    rows = []
-    for k, level in enumerate(found.levels_deg[1:].tolist()):
-        cells = (f"{float(e[k]):.5f}" for e in errors.values())
-        rows.append((f"{k + 1}", f"{level:.2f}", *cells, f"{noise[k]:.5f}"))
-    return Table("Absolute errors of theta, deg", ("step", "commanded", *errors, "standard error"), rows)
+        records.append(Number(f"fig11 steps at which {name} is not better than SSD", worse, "", tolerance=limit))
+    levels, noise = found.levels_deg[1:], found.dwells["ECC"].standard_error[1:, 2].rad2deg()
+    table = step_table("Absolute errors of theta, deg", levels, errors | {"standard error": noise}, first=1)
+    picture = Picture("fig11", draw(errors, levels), caption)
+    return Experiment("fig11", "Fig. 11: absolute errors", [picture], [table], records, REMARKS)
 
 
 def draw(errors: dict[str, Tensor], levels_deg: Tensor) -> Figure:
@@ -64,7 +48,7 @@ def draw(errors: dict[str, Tensor], levels_deg: Tensor) -> Figure:
         marks, colour = STYLES[name]
         axes.plot(steps, values, marks, color=colour, ms=4, label=name)
     axes.axhline(0, color="0.6", lw=0.8)
-    axes.set_xticks(steps, [f"{level:.2f}" for level in levels_deg.tolist()])
+    label_steps(axes, levels_deg)
     axes.set(xlabel="step (deg), up and down", ylabel="absolute error (deg)")
     axes.legend()
     return figure

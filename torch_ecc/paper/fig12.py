@@ -4,38 +4,32 @@ from __future__ import annotations
 
 import math
 
-from torch import Tensor
-
 from torch_ecc.commands.servo import draw_three_steps
 from torch_ecc.commands.servo_job import ServoJob, prepare_parts, run_alignment, setting
 from torch_ecc.commands.servo_pictures import draw_errors
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, counter
+from torch_ecc.paper.servo_trials import error_cells
 
 EXPECTED = 260  # frames, for the progress only
 LIMIT_PX, LIMIT_DEG = 0.1, 0.02
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """One alignment on the simulated workstation; ``quick`` at half the resolution."""
     scale = 0.5 if quick else 1.0
     job = ServoJob.read(setting(scale))
-    alignee, done = prepare_parts(job), [0]
-
-    def observe(*_: object) -> None:
-        done[0] += 1
-        advance(done[0], max(done[0], EXPECTED))
-
-    found = run_alignment(job, alignee, observe)
+    alignee, tick = prepare_parts(job), counter(EXPECTED, advance)
+    found = run_alignment(job, alignee, lambda *_: tick())
     logs = [step.log for step in found.alignment[1:3] if step is not None]
     x, y, theta = found.error.tolist()
     off, miss, nm = math.hypot(x, y), float(found.miss.norm()), 1e3 * job.cell.mounts["substrate"].um_per_px
     titles = ["step 2: the substrate", "step 3: the probe"]
     rows = [
-        (title, str(len(log.time)), f"{float(log.time[-1]):.2f}", *_cells(log.error[0]), *_cells(log.error[-1]))
+        (title, f"{len(log.time)}", f"{log.time[-1]:.2f}", *error_cells(log.error[0]), *error_cells(log.error[-1]))
         for title, log in zip(titles, logs, strict=False)
     ]
     header = ("step", "frames", "s", "x px", "y px", "theta deg", "x px, end", "y px, end", "theta deg, end")
-    return Outcome(
+    return Experiment(
         "fig12",
         "Fig. 12: automatic alignment of probe and substrate",
         [
@@ -46,12 +40,12 @@ def run(quick: bool, advance: Advance) -> Outcome:
         ],
         [Table("Errors as measured, when each step begins and ends", header, rows)],
         [
-            Record("aligned", float(found.alignment.aligned), "", "higher", 1.0),
-            Record("substrate, true error", off, "px", tolerance=LIMIT_PX),
-            Record("substrate, true error in nm", nm * off, "nm"),
-            Record("substrate, true error of theta", math.degrees(abs(theta)), "deg", tolerance=LIMIT_DEG),
-            Record("tip off its landing point", miss, "px", tolerance=LIMIT_PX),
-            Record("tip off its landing point in nm", nm * miss, "nm"),
+            Number("aligned", float(found.alignment.aligned), "", "higher", 1.0),
+            Number("substrate, true error", off, "px", tolerance=LIMIT_PX),
+            Number("substrate, true error in nm", nm * off, "nm"),
+            Number("substrate, true error of theta", math.degrees(abs(theta)), "deg", tolerance=LIMIT_DEG),
+            Number("tip off its landing point", miss, "px", tolerance=LIMIT_PX),
+            Number("tip off its landing point in nm", nm * miss, "nm"),
         ],
         [
             "The paper shows pictures of its workstation and gives no numbers: the limits are this project's own.",
@@ -60,8 +54,3 @@ def run(quick: bool, advance: Advance) -> Outcome:
         ],
         job.cell.microscope.seed,
     )
-
-
-def _cells(error: Tensor) -> tuple[str, str, str]:
-    x, y, theta = error.tolist()
-    return f"{x:.3f}", f"{y:.3f}", f"{math.degrees(theta):.4f}"

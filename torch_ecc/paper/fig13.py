@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from torch_ecc.commands.servo_pictures import draw_errors, draw_velocities
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
-from torch_ecc.paper.servo_trials import Single, single
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, counter
+from torch_ecc.paper.servo_trials import Single, error_cells, single
 from torch_ecc.servo.record import decay_rate
 
 CLEAN: dict[str, Any] = {
@@ -28,63 +27,43 @@ WRONG: dict[str, dict[str, Any]] = {
     "camera 3 frames late, known": {"microscope": {"delay": 3}, "control": {"delay": 3}},
 }
 GAIN, SCALE = 2.0, 0.5  # 1/s; px of the quick runs over those of the others
+REMARKS = ("The paper shows the curves without numbers: they rise at once and fall to zero as exponentials, as here.",)
 QUICK = ("as it is", "scale 20 % too large, axes 5 deg off")
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """A run without noise, and one for each wrong belief; ``quick``: only one of these, at half the resolution."""
     scale, names = (SCALE, QUICK) if quick else (1.0, tuple(WRONG))
-    clean = single(scale, **_changes(CLEAN, scale))
-    advance(1, 1 + len(names))
-    runs = {}
-    for number, name in enumerate(names, 2):
-        runs[name] = single(scale, **_changes(WRONG[name], scale))
-        advance(number, 1 + len(names))
+    every, tick = [], counter(1 + len(names), advance)
+    for changes in (CLEAN, *(WRONG[name] for name in names)):
+        every.append(single(scale, **_changes(changes, scale)))
+        tick()
+    (clean, *_), runs = every, dict(zip(names, every[1:], strict=True))
     rates = decay_rate(clean.result.log.time, clean.result.log.error, largest=0.8, smallest=0.005)
     off = 100 * (rates / GAIN - 1).abs()
     usual = runs["as it is"]
-    title = ["Substrate"]
     records = [
-        Record(f"decay of {name}, off lambda, no noise", value, "%", tolerance=5.0)
+        Number(f"decay of {name}, off lambda, no noise", value, "%", tolerance=5.0)
         for name, value in zip(("x", "y", "theta"), off.tolist(), strict=True)
     ]
-    every = [clean, *runs.values()]
     records += [
-        Record("largest velocity over its limit", max(r.speed for r in every), "", tolerance=1.0 + 1e-9),
-        Record("largest acceleration over its limit", max(r.acceleration for r in every), "", tolerance=1.0 + 1e-9),
-        Record("runs aligned", float(sum(r.result.aligned for r in every)), "", "higher", float(len(every))),
-        Record("last velocity over the largest", _last(usual), "", tolerance=0.01),
+        Number("largest velocity over its limit", max(r.speed for r in every), "", tolerance=1.0 + 1e-9),
+        Number("largest acceleration over its limit", max(r.acceleration for r in every), "", tolerance=1.0 + 1e-9),
+        Number("runs aligned", float(sum(r.result.aligned for r in every)), "", "higher", float(len(every))),
+        Number("last velocity over the largest", _last(usual), "", tolerance=0.01),
     ]
-    return Outcome(
-        "fig13",
-        "Fig. 13: velocities of visual servoing",
-        [
-            Picture(
-                "fig13", draw_velocities([usual.result.log], title), "Commanded velocities of the substrate's axes."
-            ),
-            Picture("fig13_decay", draw_errors([clean.result.log], ["Without noise"], GAIN), "Errors without noise."),
-        ],
-        [Table("What the controller believes", _HEADER, [_row(name, r) for name, r in runs.items()], _NOTE)],
-        records,
-        ["The paper shows the curves without numbers: they rise at once and fall to zero as exponentials, as here."],
-    )
-
-
-_HEADER = ("belief", "ending", "s", "x px", "y px", "theta deg")
-_NOTE = "True errors at the end."
-
-
-def _row(name: str, run: Single) -> tuple[str, ...]:
-    x, y, theta = run.error.tolist()
-    log = run.result.log
-    return (
-        name,
-        run.result.ending.name,
-        f"{float(log.time[-1]):.2f}",
-        f"{x:.3f}",
-        f"{y:.3f}",
-        f"{math.degrees(theta):.4f}",
-    )
+    velocities = draw_velocities([usual.result.log], ["Substrate"])
+    pictures = [
+        Picture("fig13", velocities, "Commanded velocities of the substrate's axes."),
+        Picture("fig13_decay", draw_errors([clean.result.log], ["Without noise"], GAIN), "Errors without noise."),
+    ]
+    rows = [
+        (name, r.result.ending.name, f"{float(r.result.log.time[-1]):.2f}", *error_cells(r.error))
+        for name, r in runs.items()
+    ]
+    header = ("belief", "ending", "s", "x px", "y px", "theta deg")
+    tables = [Table("What the controller believes", header, rows, "True errors at the end.")]
+    return Experiment("fig13", "Fig. 13: velocities of visual servoing", pictures, tables, records, REMARKS)
 
 
 def _last(run: Single) -> float:

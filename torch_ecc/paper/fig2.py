@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torch_ecc.paper import scheme
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
-from torch_ecc.plots.style import COMPONENTS, letter, new_figure, styled
-from torch_ecc.sim.scene.retinex import Retinex
+from torch_ecc.paper.drawing import second_scale
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
+from torch_ecc.plots.style import COMPONENTS, letter, new_figure
+from torch_ecc.sim import Retinex
 
 COLOURS = ("#0072b2", "#d55e00")
 LINES = (("-", "#1b1b1b"), ("--", "#8a8a8a"))  # of the two motions
@@ -27,36 +28,30 @@ REMARKS = (
 )
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Decompose the original and draw the paper's Fig. 2; both sets of amplitudes. ``quick`` changes nothing here."""
     original, parts = scheme.original().float(), scheme.components()
     motions = (scheme.CAPTION, scheme.TEXT)
     paths = [motion.path() - torch.tensor((*scheme.CENTRE, 0.0)) for motion in motions]
     advance(1, 2)
-    with styled():
-        figure = draw(original, parts, paths)
     error = float((parts.reflected * parts.incident - original).abs().max()) / 255
     rough = roughness(parts.incident)
     records = [
-        Record("fig2 reflected x incident minus original, largest", error, "of full scale", tolerance=1e-5),
-        Record("fig2 largest slope of the incident component", rough, "of its mean per px", tolerance=0.01),
+        Number("fig2 reflected x incident minus original, largest", error, "of full scale", tolerance=1e-5),
+        Number("fig2 largest slope of the incident component", rough, "of its mean per px", tolerance=0.01),
     ]
-    rows = [
-        (_words(m), f"{m.points}", f"{_fastest(p)[0]:.2f}", f"{_fastest(p)[1]:.2f}")
-        for m, p in zip(motions, paths, strict=True)
-    ]
+    rows = [(_words(m), f"{m.points}", *cells(_fastest(p), ".2f")) for m, p in zip(motions, paths, strict=True)]
     table = Table("Motion, eq. (11)", ("amplitudes", "Nop", "fastest, px per frame", "fastest, deg per frame"), rows)
     caption = (
         "(a) the original micrograph under uneven light; (b), (c) its reflected and incident components (Retinex); "
         "(d) the motion as a trajectory; (e) its components. Solid: the caption's amplitudes, dashed: the text's."
     )
+    picture = Picture("fig2", draw(original, parts, paths), caption)
     advance(2, 2)
-    return Outcome(
-        "fig2", "Fig. 2: how the sequences are made", [Picture("fig2", figure, caption)], [table], records, REMARKS
-    )
+    return Experiment("fig2", "Fig. 2: how the sequences are made", [picture], [table], records, REMARKS)
 
 
-def _words(motion: scheme.Motion) -> str:
+def _words(motion: scheme.Harmonic) -> str:
     where = "text" if motion == scheme.TEXT else "caption of Fig. 2"
     return f"{motion.amplitude:g} px, {motion.amplitude:g} px, {motion.degrees:g} deg ({where})"
 
@@ -106,9 +101,7 @@ def _amplitude(path: Tensor) -> float:
 
 
 def _draw_components(axes: Axes, paths: list[Tensor]) -> None:
-    turn = axes.twinx()
-    turn.grid(visible=False)
-    turn.spines.right.set_visible(True)
+    turn = second_scale(axes)
     for path, (dashes, _) in zip(paths, LINES, strict=True):
         j = range(1, len(path) + 1)
         axes.plot(j, path[:, 0], dashes, color=COLOURS[0], label=f"{COMPONENTS[0]} = {COMPONENTS[1]} (Nop {len(path)})")

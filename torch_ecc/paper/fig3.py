@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torch_ecc.core.pose import compose
 from torch_ecc.paper import scheme
-from torch_ecc.paper.fig3_plot import draw_curves, draw_templates
-from torch_ecc.paper.methods import METHODS, Follower, errors, largest
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table, counter
-from torch_ecc.plots.style import styled
-from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.paper.errors import by_unit, errors, largest
+from torch_ecc.paper.methods import METHODS, Follower
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells, counter
+from torch_ecc.plots.style import COMPONENTS, UNITS, letter, new_figure
+from torch_ecc.sim import Camera
 
 PAPER = {"gain": (0.05, 0.05), "ref34": (0.07, 0.35)}  # px, deg: the paper's largest errors with UI
 EVEN_LIMIT = (0.005, 0.005)  # px, deg, of every ecc without UI
 LIMITS = {"gain": (0.05, 0.05), "ecc_paper": (0.05, 0.05), "linear": (0.01, 0.01), "quadratic": (0.01, 0.01)}
 TEMPLATES, POSES, REACH = 13, 16, 700.0  # cut elsewhere, poses of each, px of the square that they are drawn from
 SEED = 1
+ECC, SSD = ("gain", "ecc_paper", "linear", "quadratic"), ("ssd", "ref34")
+PANELS = (
+    ("(a) ECC, without uneven light", "without UI", ECC),
+    ("(b) ECC, with uneven light", "with UI", ECC),
+    ("(c) SSD, without uneven light", "without UI", SSD),
+    ("(d) SSD, with uneven light", "with UI", SSD),
+)
 Errors = dict[str, dict[str, Tensor]]  # by camera and method: (F, 3) px, px, deg
 
 
@@ -34,7 +43,7 @@ class Spread(NamedTuple):
     reflected: Tensor
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Track and draw. ``quick``: half a cycle (the other half goes back the same way), the text's amplitudes only."""
     motions = (scheme.TEXT,) if quick else (scheme.TEXT, scheme.CAPTION)
     paths = {m: m.path()[: m.points // 2] if quick else m.path() for m in motions}
@@ -42,13 +51,11 @@ def run(quick: bool, advance: Advance) -> Outcome:
     tick = counter(sum(map(len, paths.values())) + count * poses, advance)
     found = {motion: sequence_errors(path, tick) for motion, path in paths.items()}
     spread = template_errors(count, poses, tick)
-    with styled():
-        pictures = [_curves(motion, e) for motion, e in found.items()]
-        pictures.append(_spread(spread))
+    pictures = [*(_curves(motion, e) for motion, e in found.items()), _spread(spread)]
     tables = [_table(motion, e) for motion, e in found.items()] + [_spread_table(spread)]
     records = [r for motion, e in found.items() for r in _records(motion, e)]
     title = "Fig. 3: uneven illumination"
-    return Outcome("fig3", title, pictures, tables, records, _remarks(found, spread), SEED)
+    return Experiment("fig3", title, pictures, tables, records, _remarks(found, spread), SEED)
 
 
 def cameras() -> dict[str, Camera]:
@@ -100,10 +107,10 @@ def template_errors(count: int, poses: int, tick: Callable[[], None]) -> Spread:
 def _align_all(template: Tensor, frames: Tensor, truth: Tensor) -> Tensor:
     """Largest errors (methods, 2) px, deg with one template over frames (F, 1, h, w), started at the truth (F, 3)."""
     many = template.expand(len(frames), -1, -1, -1)
-    return torch.tensor([largest(errors(m.start(many, truth).track(frames), truth)) for m in METHODS.values()])
+    return torch.tensor([by_unit(largest(errors(m.start(many, truth).track(frames), truth))) for m in METHODS.values()])
 
 
-def _curves(motion: scheme.Motion, found: Errors) -> Picture:
+def _curves(motion: scheme.Harmonic, found: Errors) -> Picture:
     name = "fig3" if motion == scheme.TEXT else "fig3_caption"
     caption = (
         f"Errors along eq. (11), {motion}. First row ECC without and with uneven illumination, second row SSD; "
@@ -118,15 +125,73 @@ def _spread(spread: Spread) -> Picture:
         "How much depends on the template: largest errors with uneven light of the template in the middle of the "
         f"micrograph (diamond) and of {len(spread.first) - 1} at random places (dots), text's amplitudes."
     )
-    return Picture("fig3_templates", draw_templates(panels, PAPER), caption)
+    return Picture("fig3_templates", draw_templates(panels), caption)
 
 
-def _table(motion: scheme.Motion, found: Errors) -> Table:
+def draw_curves(found: Mapping[str, Mapping[str, Tensor]]) -> Figure:
+    """Errors (F, 3) px, px, deg of every method: four panels of three components, laid out as the paper's Fig. 3."""
+    figure = new_figure(11, 9)
+    parts: Any = figure.subfigures(2, 2)
+    for part, (title, camera, methods) in zip(parts.flat, PANELS, strict=True):
+        rows = part.subplots(3, 1, sharex=True)
+        letter(rows[0], title)
+        for k, axes in enumerate(rows):
+            _draw_component(axes, {m: found[camera][m][:, k] for m in methods})
+            axes.set_ylabel(f"{COMPONENTS[k]} error ({UNITS[k]})")
+            values = torch.stack([by_method[m][:, k] for by_method in found.values() for m in methods])
+            low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
+            axes.set_ylim(low - 0.15 * (high - low), high + 0.4 * (high - low))
+        rows[-1].set_xlabel("frame j")
+    return figure
+
+
+def _draw_component(axes: Axes, curves: Mapping[str, Tensor]) -> None:
+    """One component of some methods' errors (F,), each with its name and largest value above."""
+    for k, (method, values) in enumerate(curves.items()):
+        style = METHODS[method]
+        axes.plot(range(1, len(values) + 1), values, style.dashes, color=style.colour)
+        text = f"{method} {float(values.abs().max()):.4f}"
+        axes.text(0.01 + 0.25 * k, 0.86, text, color=style.colour, transform=axes.transAxes, fontsize=8)
+
+
+def draw_templates(panels: Mapping[str, Tensor]) -> Figure:
+    """Largest errors (P, methods, 2) px, deg of P templates, one column per method: the first as a diamond, the others
+    as dots with their median."""
+    figure = new_figure(11, 6)
+    grid = figure.subplots(2, len(panels), sharex=True, sharey="row", squeeze=False)
+    for column, (title, values) in zip(grid.T, panels.items(), strict=True):
+        letter(column[0], title)
+        for k, axes in enumerate(column):
+            _dots(axes, values[..., k])
+            for method, limits in PAPER.items():
+                x = list(METHODS).index(method)
+                axes.plot((x - 0.42, x + 0.42), (limits[k],) * 2, color="#d62728", lw=1.6, label="the paper's largest")
+            axes.set_yscale("log")
+            axes.set_xticks(range(len(METHODS)), METHODS)
+    grid[0, 0].set_ylabel("largest error of x, y (px)")
+    grid[1, 0].set_ylabel(r"largest error of $\theta$ (deg)")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def _dots(axes: Axes, values: Tensor) -> None:
+    """(P, methods) above each method's name, spread sideways in a fixed order."""
+    side = torch.linspace(-0.25, 0.25, len(values) - 1)
+    for x, method in enumerate(METHODS):
+        colour, column = METHODS[method].colour, values[:, x]
+        axes.plot(x + side, column[1:], "o", ms=4, alpha=0.7, color=colour, zorder=3)
+        axes.plot(x, column[0], "D", ms=7, mfc="white", mew=1.6, color=colour, zorder=4)
+        axes.plot((x - 0.35, x + 0.35), (column[1:].quantile(0.5),) * 2, color="black", label="median of the dots")
+
+
+def _table(motion: scheme.Harmonic, found: Errors) -> Table:
     rows = []
     for name, method in METHODS.items():
-        cells = [f"{v:.4f}" for camera in found.values() for v in largest(camera[name])]
+        ours = [v for camera in found.values() for v in by_unit(largest(camera[name]))]
         paper = "{:g} px, {:g} deg".format(*PAPER[name]) if name in PAPER else ""
-        rows.append((method.label, *cells, paper))
+        rows.append((method.label, *cells(ours, ".4f"), paper))
     header = ("method", "without UI, px", "deg", "with UI, px", "deg", "paper, with UI")
     note = "Template cut from the first frame (Algorithm 1, line 3). px: the larger of x and y. 8 bit, no noise."
     return Table(f"Largest errors, {motion}", header, rows, note)
@@ -136,8 +201,7 @@ def _spread_table(spread: Spread) -> Table:
     rows = []
     for k, method in enumerate(METHODS.values()):
         middle = "{:.4f} px, {:.4f} deg".format(*spread.reflected[0, k].tolist())
-        cells = [_range(values[1:, k, unit]) for values in spread for unit in (0, 1)]
-        rows.append((method.label, middle, *cells))
+        rows.append((method.label, middle, *(_range(values[1:, k, unit]) for values in spread for unit in (0, 1))))
     header = ("method", "middle, evenly lit", "elsewhere, first frame, px", "deg", "elsewhere, evenly lit, px", "deg")
     title = f"Largest errors with UI by template: the middle one, and {len(spread.first) - 1} elsewhere"
     note = (
@@ -151,25 +215,25 @@ def _range(values: Tensor) -> str:
     return f"{values.quantile(0.5):.4f} ({values.min():.4f} to {values.max():.4f})"
 
 
-def _records(motion: scheme.Motion, found: Errors) -> list[Record]:
+def _records(motion: scheme.Harmonic, found: Errors) -> list[Number]:
     records = []
     for camera, by_method in found.items():
         for name, error in by_method.items():
             limit = LIMITS.get(name) if camera == "with UI" else EVEN_LIMIT if name in LIMITS else None
             paper = PAPER.get(name) if camera == "with UI" else None
-            for k, (value, unit) in enumerate(zip(largest(error), ("px", "deg"), strict=True)):
+            for k, (value, unit) in enumerate(zip(by_unit(largest(error)), ("px", "deg"), strict=True)):
                 label = f"fig3 {motion.degrees:g} deg, {name}, {camera}, largest {'theta' if k else 'x, y'}"
-                records.append(Record(label, value, unit, tolerance=limit and limit[k], paper=paper and paper[k]))
+                records.append(Number(label, value, unit, tolerance=limit and limit[k], paper=paper and paper[k]))
         if camera == "with UI":
-            ratio = largest(by_method["ref34"])[1] / largest(by_method["gain"])[1]
+            ratio = float(largest(by_method["ref34"])[2] / largest(by_method["gain"])[2])
             label = f"fig3 {motion.degrees:g} deg, theta error of ref34 over that of gain, with UI"
-            records.append(Record(label, ratio, "1", "higher", 2.0, PAPER["ref34"][1] / PAPER["gain"][1]))
+            records.append(Number(label, ratio, "1", "higher", 2.0, PAPER["ref34"][1] / PAPER["gain"][1]))
     return records
 
 
-def _remarks(by_motion: dict[scheme.Motion, Errors], spread: Spread) -> list[str]:
+def _remarks(by_motion: dict[scheme.Harmonic, Errors], spread: Spread) -> list[str]:
     found = by_motion[scheme.TEXT]
-    lit = {name: largest(error) for name, error in found["with UI"].items()}
+    lit = {name: by_unit(largest(error)) for name, error in found["with UI"].items()}
     least, most = {}, {}
     for k, name in enumerate(METHODS):
         both = torch.cat((spread.first[1:, k], spread.reflected[1:, k]))
@@ -197,7 +261,7 @@ def _remarks(by_motion: dict[scheme.Motion, Errors], spread: Spread) -> list[str
         "numbers for that case.",
     ]
     if scheme.CAPTION in by_motion:
-        ratio = [largest(by_motion[scheme.CAPTION]["with UI"][m])[1] for m in ("ref34", "gain")]
+        ratio = [float(largest(by_motion[scheme.CAPTION]["with UI"][m])[2]) for m in ("ref34", "gain")]
         remarks.append(
             "With the amplitudes of Fig. 2's caption the first frame, and the template that is cut upright from it, "
             f"lies at another angle. On that template SSD is not worse in theta: ref. 34 {ratio[0]:.4f} deg, gain "

@@ -7,20 +7,20 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torch_ecc.core.pose import rotation
 from torch_ecc.paper import scheme
-from torch_ecc.paper.bound import QUANTISATION, cramer_rao
-from torch_ecc.paper.fig4_plot import draw_boxes
-from torch_ecc.paper.methods import METHODS, Follower, errors
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table, counter
-from torch_ecc.plots.style import styled
-from torch_ecc.sim.camera.camera import Camera
-from torch_ecc.sim.camera.sensor import noise_sigma
+from torch_ecc.paper.bound import cramer_rao, rounding
+from torch_ecc.paper.drawing import draw_box, draw_range
+from torch_ecc.paper.errors import box, by_unit, errors, in_degrees, largest, rms
+from torch_ecc.paper.methods import COMPARED, METHODS, Follower
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells, counter
+from torch_ecc.plots.style import COMPONENTS, UNITS, letter, new_figure
+from torch_ecc.sim import Camera, noise_sigma
 
 VARIANCES = (0.001, 0.002, 0.005)  # of the noise on the [0, 1] scale
-USED = ("linear", "gain", "ecc_paper", "ssd", "ref34")
 DRAWS = 4  # fresh noise at every pose
 BOX, WHISKER = 0.02, 0.05  # px: the paper's main and maximum errors of x and y
 RATIO_LIMIT = 1.1
@@ -29,7 +29,8 @@ FROM = {  # where templates come from
     "noisy": "the first frame of the noisy sequence (Algorithm 1, line 3)",
 }
 SEED = 40
-UNIT = torch.tensor((1.0, 1.0, math.degrees(1.0)), dtype=torch.float64)
+ROWS = (("(a) ECC", "linear"), ("(b) SSD", "ref34"))
+QUARTILE = 0.6745  # of a Gaussian, in standard deviations
 
 
 class Noisy(NamedTuple):
@@ -44,29 +45,31 @@ class Noisy(NamedTuple):
         """Rms error over the bound, (3,), along the template's own axes, which turn with it."""
         error = self.errors[method]
         own = torch.cat(((error[:, None, :2] @ rotation(self.theta))[:, 0], error[:, 2:]), -1)
-        return own.square().mean(0).sqrt() / self.bound
+        return rms(own) / self.bound
+
+    def extent(self, method: str) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The end of the box and the largest error, px and deg each."""
+        return by_unit(box(self.errors[method])), by_unit(largest(self.errors[method]))
 
     def over(self, method: str) -> float:
         """Rms error over the bound, all components together."""
-        return float(self.ratio(method).square().mean().sqrt())
+        return float(rms(self.ratio(method)))
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Align and draw. ``quick``: every fourth pose of the cycle, noise-free template only."""
     path = scheme.TEXT.path()
     poses = torch.arange(1, len(path), 4 if quick else 1)
     cuts = {"noise-free": scheme.cut_reflected()} | ({} if quick else {"noisy": scheme.cut_first(path)})
     tick = counter(len(cuts) * len(poses), advance)
     found = {kind: trials(path, poses, cut, tick) for kind, cut in cuts.items()}
-    with styled():
-        pictures = [_picture(kind, noisy) for kind, noisy in found.items()]
+    pictures = [_picture(kind, noisy) for kind, noisy in found.items()]
     tables = [_table(kind, noisy) for kind, noisy in found.items()]
     records = [record for kind, noisy in found.items() for record in _records(kind, noisy)]
-    return Outcome("fig4", "Fig. 4: image noise", pictures, tables, records, _remarks(found), SEED)
+    return Experiment("fig4", "Fig. 4: image noise", pictures, tables, records, _remarks(found), SEED)
 
 
 def _picture(kind: str, found: dict[str, Noisy]) -> Picture:
-    errors, bounds = {v: n.errors for v, n in found.items()}, {v: n.bound for v, n in found.items()}
     caption = (
         f"Template cut from {FROM[kind]}. (a) ECC (linear), (b) SSD (ref. 34), conventions of the paper's Fig. 4: box "
         "from the lower to the upper quartile, red line the mean, dashed line to the smallest and largest value that "
@@ -74,7 +77,26 @@ def _picture(kind: str, found: dict[str, Noisy]) -> Picture:
         f"Dotted: box and maximum that the paper's text states, {BOX:g} and {WHISKER:g} px."
     )
     name = "fig4" if kind == "noise-free" else "fig4_noisy_template"
-    return Picture(name, draw_boxes(errors, bounds, (BOX, WHISKER)), caption)
+    return Picture(name, draw(found), caption)
+
+
+def draw(found: dict[str, Noisy]) -> Figure:
+    """Boxes of each component by variance, ECC above SSD."""
+    figure = new_figure(11, 6.4)
+    grid = figure.subplots(2, 3, sharex=True, sharey="col")
+    for row, (title, method) in zip(grid, ROWS, strict=True):
+        for k, axes in enumerate(row):
+            for x, noisy in enumerate(found.values(), 1):
+                half = QUARTILE * float(noisy.bound[k])
+                axes.fill_between((x - 0.45, x + 0.45), -half, half, color="#bdbdbd", lw=0, alpha=0.6)
+                draw_box(axes, x, noisy.errors[method][:, k])
+            for limit in (BOX, WHISKER) if UNITS[k] == "px" else ():
+                draw_range(axes, limit)
+            names = [rf"$\sigma_{x}^2 = {variance}$" for x, variance in enumerate(found, 1)]
+            axes.set_xticks(range(1, len(names) + 1), names)
+            axes.set_ylabel(f"{COMPONENTS[k]} error ({UNITS[k]})")
+            letter(axes, f"{title}: {COMPONENTS[k]}")
+    return figure
 
 
 def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None]) -> dict[str, Noisy]:
@@ -87,9 +109,9 @@ def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None
     noisy = bool((cut.pose == path[0]).all())
     still = scheme.Kept(scene, scene.render(cut.pose[None], scheme.FRAME))
     many = torch.zeros(DRAWS, dtype=torch.long)
-    bound = UNIT * cramer_rao(cut.seen(scene), (scheme.SIZE, scheme.SIZE), 2.0 if noisy else 1.0)
+    bound = in_degrees(cramer_rao(scene, (scheme.SIZE, scheme.SIZE), 2.0 if noisy else 1.0, cut.place()))
     cameras = {v: Camera(size=scheme.FRAME, noise_sigma=noise_sigma(v)) for v in VARIANCES}
-    found: dict[float, dict[str, list[Tensor]]] = {v: {m: [] for m in USED} for v in VARIANCES}
+    found: dict[float, dict[str, list[Tensor]]] = {v: {m: [] for m in COMPARED} for v in VARIANCES}
     followers: dict[str, Follower] = {}
     for k in poses.tolist():
         clean = scheme.Kept(scene, scene.render(path[k : k + 1], scheme.FRAME))
@@ -98,13 +120,13 @@ def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None
             if noisy or not followers:
                 source = camera if noisy else Camera(size=scheme.FRAME)
                 first = source.capture(still, cut.pose.expand(DRAWS, 3), seed=SEED + 3 + number, first=k * DRAWS)
-                followers = {m: METHODS[m].start(cut.template(first), truth[k - 1 + many]) for m in USED}
+                followers = {m: METHODS[m].start(cut.template(first), truth[k - 1 + many]) for m in COMPARED}
             for m, follower in followers.items():
                 follower.pose = truth[k - 1 + many]
                 found[v][m].append(errors(follower.track(frames), truth[k + many]))
         tick()
     theta = truth[poses, 2].repeat_interleave(DRAWS)
-    level = {v: math.sqrt(noise_sigma(v) ** 2 + QUANTISATION) for v in VARIANCES}
+    level = {v: math.sqrt(noise_sigma(v) ** 2 + rounding(8)) for v in VARIANCES}
     return {
         f"{v:g}": Noisy({m: torch.cat(e) for m, e in by.items()}, theta, bound * level[v]) for v, by in found.items()
     }
@@ -113,11 +135,10 @@ def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None
 def _table(kind: str, found: dict[str, Noisy]) -> Table:
     rows = []
     for variance, noisy in found.items():
-        for name in USED:
-            box, most = quartiles(noisy.errors[name]), noisy.errors[name].abs().amax(0)
-            cells = [f"{max(box[:2]):.4f}", f"{max(most[:2]):.4f}", f"{box[2]:.4f}", f"{most[2]:.4f}"]
-            ratios = " ".join(f"{v:.2f}" for v in noisy.ratio(name))
-            rows.append((variance, METHODS[name].label, *cells, ratios))
+        for name in COMPARED:
+            (side, turn), (far, far_turn) = noisy.extent(name)
+            ratios = " ".join(cells(noisy.ratio(name), ".2f"))
+            rows.append((variance, METHODS[name].label, *cells((side, far, turn, far_turn), ".4f"), ratios))
     rows.append(("all", "paper, ECC and SSD", f"{BOX:g}", f"{WHISKER:g}", "", "", ""))
     header = ("variance", "method", "box, px", "largest, px", "box, deg", "largest, deg", "rms / bound x y theta")
     count = len(next(iter(found.values())).theta)
@@ -128,37 +149,36 @@ def _table(kind: str, found: dict[str, Noisy]) -> Table:
     return Table(f"Template cut from {FROM[kind]}", header, rows, note)
 
 
-def quartiles(error: Tensor) -> Tensor:
-    """The farther of both quartiles from zero: (n, 3) -> (3,)."""
-    levels = error.new_tensor((0.25, 0.75))
-    return error.quantile(levels, dim=0).abs().amax(0)
-
-
-def _records(kind: str, found: dict[str, Noisy]) -> list[Record]:
+def _records(kind: str, found: dict[str, Noisy]) -> list[Number]:
     records = []
     for variance, noisy in found.items():
-        for name in USED:
-            error, label = noisy.errors[name], f"fig4 {kind} template, variance {variance}, {name}"
+        for name in COMPARED:
+            label = f"fig4 {kind} template, variance {variance}, {name}"
             limit = RATIO_LIMIT if name == "linear" else None
-            box, most = quartiles(error), error.abs().amax(0)
+            (side, turn), (far, far_turn) = noisy.extent(name)
             records += [
-                Record(f"{label}, rms over the bound", noisy.over(name), "1", tolerance=limit),
-                Record(f"{label}, box of x, y", float(box[:2].max()), "px", paper=BOX),
-                Record(f"{label}, largest of x, y", float(most[:2].max()), "px", paper=WHISKER),
-                Record(f"{label}, box of theta", float(box[2]), "deg"),
-                Record(f"{label}, largest of theta", float(most[2]), "deg"),
+                Number(f"{label}, rms over the bound", noisy.over(name), "1", tolerance=limit),
+                Number(f"{label}, box of x, y", side, "px", paper=BOX),
+                Number(f"{label}, largest of x, y", far, "px", paper=WHISKER),
+                Number(f"{label}, box of theta", turn, "deg"),
+                Number(f"{label}, largest of theta", far_turn, "deg"),
             ]
     return records
 
 
 def _remarks(found: dict[str, dict[str, Noisy]]) -> list[str]:
-    boxes = "; ".join(f"{kind} template {_boxes(noisy)}" for kind, noisy in found.items())
-    over = "; ".join(f"{kind} template: {_all_over(noisy)}" for kind, noisy in found.items())
+    boxes, over = [], []
+    for kind, by_variance in found.items():
+        extents = [noisy.extent("linear") for noisy in by_variance.values()]
+        boxes.append(f"{kind} template " + ", ".join(f"{side:.3f} ({far:.3f})" for (side, _), (far, _) in extents))
+        ratios = (f"{m} " + " ".join(f"{noisy.over(m):.2f}" for noisy in by_variance.values()) for m in COMPARED)
+        over.append(f"{kind} template: {', '.join(ratios)}")
     remarks = [
-        f"Boxes (and largest errors) of x and y with ecc at the three variances: {boxes}. Paper: within 0.02 px "
-        "(0.05). The largest of so many draws is some 3.5 times the standard deviation, whatever the method.",
+        f"Boxes (and largest errors) of x and y with ecc at the three variances: {' px; '.join(boxes)} px. Paper: "
+        "within 0.02 px (0.05). The largest of so many draws is some 3.5 times the standard deviation, whatever the "
+        "method.",
         "No unbiased method can scatter less than the Cramer-Rao bound. Rms over it at the three variances: "
-        f"{over}. What is left of the errors belongs to the images.",
+        f"{'; '.join(over)}. What is left of the errors belongs to the images.",
         "In theta the paper sees ECC ahead of SSD under noise. With equal samplers, equal gradients and one stop rule "
         "there is no such difference, and there can be none: in even light SSD has fewer unknowns, not more.",
         "ref. 34 is given the gradient of the slightly blurred template. With raw differences, which hold the "
@@ -173,17 +193,3 @@ def _remarks(found: dict[str, dict[str, Noisy]]) -> list[str]:
             "frame before do not always suffice for ssd; with more it scatters as the others do."
         )
     return remarks
-
-
-def _boxes(found: dict[str, Noisy]) -> str:
-    """Box and largest error of ecc's x and y at each variance, in words."""
-    parts = []
-    for noisy in found.values():
-        error = noisy.errors["linear"][:, :2]
-        parts.append(f"{float(quartiles(error).max()):.3f} ({float(error.abs().max()):.3f})")
-    return ", ".join(parts) + " px"
-
-
-def _all_over(found: dict[str, Noisy]) -> str:
-    """Rms over the bound at each variance, by method, in words."""
-    return ", ".join(f"{m} " + " ".join(f"{noisy.over(m):.2f}" for noisy in found.values()) for m in USED)

@@ -10,9 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from torch_ecc.paper.acquisition import times
 from torch_ecc.paper.circles import Round, common_angle, rounds
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
-from torch_ecc.plots.style import COMPONENTS, letter, new_figure, styled
+from torch_ecc.paper.drawing import second_scale
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
+from torch_ecc.plots.style import COMPONENTS, letter, new_figure
 
 VISION, CDS, FIT = ("#0072b2", "#56b4e9"), ("#d55e00", "#e69f00"), "#1b1b1b"
 ANGLE_LIMIT = 0.01  # deg, of the straight lines against the true angle between image and stage
@@ -24,82 +26,53 @@ REMARKS = (
 )
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Both circles, drawn as the paper's Fig. 6. ``quick``: twice as fast."""
     found = rounds(quick, advance)
-    with styled():
-        figure = draw(found)
     caption = (
         "Results for circular trajectories. (a) in three dimensions; (b) in the plane, with circles fitted to the CDS "
         "data; (c) enlarged part of (b); (d) components of the vision method."
     )
-    title = "Fig. 6: circular trajectories"
-    tables = [_table(found), _times(found)]
-    return Outcome("fig6", title, [Picture("fig6", figure, caption)], tables, _records(found), REMARKS)
+    title, picture = "Fig. 6: circular trajectories", Picture("fig6", draw(found), caption)
+    tables = [_table(found), times({f"{r.radius:g} um": r.acquired for r in found})]
+    return Experiment("fig6", title, [picture], tables, _records(found), REMARKS)
 
 
-def _records(found: list[Round]) -> list[Record]:
+def _records(found: list[Round]) -> list[Number]:
     true = found[0].axis_angle
     error = abs(math.degrees(common_angle(found) - true))
-    records = [Record("fig6 angle of image and stage by straight lines, error", error, "deg", tolerance=ANGLE_LIMIT)]
+    records = [Number("fig6 angle of image and stage by straight lines, error", error, "deg", tolerance=ANGLE_LIMIT)]
     for r in found:
         name = f"fig6 {r.radius:g} um:"
         joint = abs(math.degrees(r.joint.axis_angle - true))
+        major, minor = r.ellipse.semi_axes.tolist()
+        oval = r.ellipse.residual_rms / r.circle.residual_rms
         lost = float((~r.track.pose.isfinite().all(1)).sum())
         records += [
-            Record(f"{name} angle by the joint estimate, error", joint, "deg", tolerance=ANGLE_LIMIT),
-            Record(f"{name} major semi-axis over the commanded radius", _axes(r)[0] / r.radius, "", tolerance=1.0),
-            Record(f"{name} minor semi-axis over the commanded radius", _axes(r)[1] / r.radius, "", tolerance=1.0),
-            Record(f"{name} rms distance from an ellipse over that from a circle", _oval(r), "", tolerance=1.0),
-            Record(f"{name} lost frames", lost, "", tolerance=0.0),
+            Number(f"{name} angle by the joint estimate, error", joint, "deg", tolerance=ANGLE_LIMIT),
+            Number(f"{name} major semi-axis over the commanded radius", major / r.radius, "", tolerance=1.0),
+            Number(f"{name} minor semi-axis over the commanded radius", minor / r.radius, "", tolerance=1.0),
+            Number(f"{name} rms distance from an ellipse over that from a circle", oval, "", tolerance=1.0),
+            Number(f"{name} lost frames", lost, "", tolerance=0.0),
         ]
     return records
 
 
-def _axes(r: Round) -> list[float]:
-    axes: list[float] = r.ellipse.semi_axes.tolist()
-    return axes
-
-
-def _oval(r: Round) -> float:
-    return r.ellipse.residual_rms / r.circle.residual_rms
-
-
 def _table(found: list[Round]) -> Table:
     header = ("", *(f"{r.radius:g} um" for r in found))
+    joint = [(r.joint.axis_angle, r.joint.sigma["axis_angle_rad"]) for r in found]
     lines = {
         "circle fitted to the CDS data: radius, um": [f"{r.circle.radius:.3f}" for r in found],
         "  rms distance from the circle, nm": [f"{1e3 * r.circle.residual_rms:.0f}" for r in found],
-        "ellipse: semi-axes, um": ["{:.3f}, {:.3f}".format(*_axes(r)) for r in found],
+        "ellipse: semi-axes, um": ["{:.3f}, {:.3f}".format(*r.ellipse.semi_axes.tolist()) for r in found],
         "  rms distance from the ellipse, nm": [f"{1e3 * r.ellipse.residual_rms:.0f}" for r in found],
         "angle of image and stage, deg: straight lines": [f"{math.degrees(r.line_angle):.4f}" for r in found],
-        "  joint estimate": [_with_sigma(r) for r in found],
+        "  joint estimate": [f"{math.degrees(a):.4f} +- {math.degrees(s):.4f}" for a, s in joint],
         "  true": [f"{math.degrees(r.axis_angle):.4f}" for r in found],
     }
     rows = [(name, *cells) for name, cells in lines.items()]
     note = "The angle by all straight lines together: " + f"{math.degrees(common_angle(found)):.4f} deg."
     return Table("What the trajectories were", header, rows, note)
-
-
-def _with_sigma(r: Round) -> str:
-    return f"{math.degrees(r.joint.axis_angle):.4f} +- {math.degrees(r.joint.sigma['axis_angle_rad']):.4f}"
-
-
-def _times(found: list[Round]) -> Table:
-    """Seconds of each part of the simulation, and of all."""
-    names = list(found[0].acquired.seconds)
-    rows = [
-        (
-            f"{r.radius:g} um",
-            *(f"{r.acquired.seconds[name]:.1f}" for name in names),
-            f"{sum(r.acquired.seconds.values()):.1f}",
-        )
-        for r in found
-    ]
-    frames, samples = len(found[0].track.time_s), len(found[0].sensors.time_s)
-    h, w = found[0].acquired.first.shape
-    title = f"Time in s: {frames} frames of {w}x{h} px and {samples} samples of three sensors, each"
-    return Table(title, ("", *names, "all"), rows)
 
 
 def draw(found: list[Round]) -> Figure:
@@ -147,9 +120,7 @@ def _draw_plane(axes: Axes, found: list[Round], *, legend: bool) -> None:
 
 def _draw_parts(axes: Axes, found: list[Round]) -> None:
     """x and y of the vision method; theta, which stays within its noise, on its own scale."""
-    turn = axes.twinx()
-    turn.grid(visible=False)
-    turn.spines.right.set_visible(True)
+    turn = second_scale(axes)
     for k, r in enumerate(found):
         for i, dashes in enumerate(("-", "--")):
             label = f"{COMPONENTS[i]}, {r.radius:g} um"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
-from torch_ecc.paper.steps import METHODS, Staircase, staircase
-from torch_ecc.plots.style import new_figure, styled
+from torch_ecc.paper.acquisition import times
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture
+from torch_ecc.paper.steps import METHODS, Staircase, staircase, step_table
+from torch_ecc.plots.style import new_figure
 
 CDS, ECC = "#d55e00", "#0072b2"
 REMARKS = (
@@ -16,40 +17,25 @@ REMARKS = (
 )
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """The staircase, drawn as the paper's Fig. 8. ``quick``: dwells of 0.3 s instead of 3 s."""
     found = staircase(quick, advance)
-    with styled():
-        figure = draw(found)
     caption = (
         "Tracking results of ECC and CDS for the angular trajectory, 0.04 deg steps to 0.24 deg and back. The inset "
         "enlarges the highest step."
     )
     lost = sum(int((~track.pose.isfinite().all(1)).sum()) for track in found.tracks.values())
-    highest = float(found.dwells["CDS"].mean[:, 2].max().rad2deg())
+    highest = float(found.mean_deg("CDS").max())
     clock = 1e6 * abs(found.alignment.offset_s - found.acquired.offset_s)
     records = [
-        Record("fig8 lost frames", float(lost), "", tolerance=0.0),
-        Record("fig8 highest step by the CDS, 0.24 deg commanded", highest, "deg", "higher"),
-        Record("fig8 clock offset by the joint estimate, error", clock, "us", tolerance=1000.0),
+        Number("fig8 lost frames", float(lost), "", tolerance=0.0),
+        Number("fig8 highest step by the CDS, 0.24 deg commanded", highest, "deg", "higher"),
+        Number("fig8 clock offset by the joint estimate, error", clock, "us", tolerance=1000.0),
     ]
-    tables = [_table(found), _times(found)]
-    return Outcome("fig8", "Fig. 8: angular trajectory", [Picture("fig8", figure, caption)], tables, records, REMARKS)
-
-
-def _table(found: Staircase) -> Table:
-    rows = []
-    for k, level in enumerate(found.levels_deg.tolist()):
-        means = (found.dwells[name].mean[k, 2].rad2deg() for name in ("CDS", *METHODS))
-        rows.append((f"{k}", f"{level:.2f}", *(f"{float(mean):.5f}" for mean in means)))
-    return Table("Mean theta of each step, deg", ("step", "commanded", "CDS", *METHODS), rows)
-
-
-def _times(found: Staircase) -> Table:
-    seconds, (h, w) = found.acquired.seconds, found.acquired.first.shape
-    frames, samples = len(found.acquired.truth.time_s), len(found.sensors.time_s)
-    title = f"Time in s: {frames} frames of {w}x{h} px and {samples} samples of three sensors"
-    return Table(title, tuple(seconds), [tuple(f"{value:.1f}" for value in seconds.values())])
+    means = {name: found.mean_deg(name) for name in ("CDS", *METHODS)}
+    tables = [step_table("Mean theta of each step, deg", found.levels_deg, means), times({"staircase": found.acquired})]
+    picture = Picture("fig8", draw(found), caption)
+    return Experiment("fig8", "Fig. 8: angular trajectory", [picture], tables, records, REMARKS)
 
 
 def draw(found: Staircase) -> Figure:
@@ -64,7 +50,7 @@ def draw(found: Staircase) -> Figure:
         panel.plot(*ecc, color=ECC, lw=0.7, label="ECC")
     top = int(found.levels_deg.argmax())
     start, end = found.windows_s[top].tolist()
-    middle = float(found.dwells["CDS"].mean[top, 2].rad2deg())
+    middle = float(found.mean_deg("CDS")[top])
     inset.set(xlim=(start, end), ylim=(middle - 0.012, middle + 0.012))
     inset.tick_params(labelsize=7.5)
     axes.indicate_inset_zoom(inset, edgecolor="0.4")

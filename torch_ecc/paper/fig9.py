@@ -9,20 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ecc.paper.parasitic import (
-    Deviations,
-    aliased,
-    deviations,
-    lever_arm,
-    other_sensors,
-    predicted,
-    scattered,
-    sensed,
-    true_deviations,
-)
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
+from torch_ecc.paper import parasitic
+from torch_ecc.paper.errors import rms
+from torch_ecc.paper.parasitic import Deviations
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
 from torch_ecc.paper.steps import VIEW_UM, Staircase, staircase
-from torch_ecc.plots.style import COMPONENTS, letter, new_figure, styled
+from torch_ecc.plots.style import COMPONENTS, letter, new_figure
 
 UP, DOWN, LAW = "#0072b2", "#d55e00", "#1b1b1b"
 SETS = 200  # of sensors, against which the same track is held
@@ -38,48 +30,38 @@ REMARKS = (
 )
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """x and y of ECC while theta steps, drawn as the paper's Fig. 9. ``quick``: dwells of 0.3 s."""
     found = staircase(quick, advance)
-    by_sensors, by_truth = deviations(found), true_deviations(found)
-    with styled():
-        figure = draw(found, by_sensors, by_truth)
+    by_sensors, by_truth = parasitic.deviations(found), parasitic.true_deviations(found)
     caption = (
         "Translation of ECC during the angular trajectory. (a) in the plane, ascent and descent; (b) its components "
         "over time. Black and grey: lever arm times the sensors' angle, which rings after each step. "
         "(c) means of the steps minus lever arm times angle, with their standard deviations."
     )
-    lever, spread = lever_arm(found, by_sensors.covariance)
+    lever, spread = parasitic.lever_arm(found, by_sensors.covariance)
     share = float(((lever - lever.new_tensor(VIEW_UM)).abs() / spread).max())
-    others = _rms(torch.stack([some.nm / some.sigma for some in other_sensors(found, SETS)]))
+    others = torch.cat([(some.nm / some.sigma).flatten() for some in parasitic.other_sensors(found, SETS)])
+    label = f"fig9 steps: rms deviation over sigma with {SETS} other sets of sensors"
     records = [
-        Record("fig9 lever arm from the steps: error over its sigma", share, "", tolerance=3.0),
-        Record("fig9 steps: rms deviation from lever arm times angle", _rms(by_sensors.nm), "nm"),
-        Record("fig9 steps: chi-square per degree of freedom", by_sensors.chi_square, "", tolerance=2.0),
-        Record("fig9 steps by the true angle: rms deviation", _rms(by_truth.nm), "nm"),
-        Record("fig9 steps by the true angle: chi-square", by_truth.chi_square, "", tolerance=2.0),
-        Record(f"fig9 steps: rms deviation over sigma with {SETS} other sets of sensors", others, "", tolerance=1.2),
+        Number("fig9 lever arm from the steps: error over its sigma", share, "", tolerance=3.0),
+        Number("fig9 steps: rms deviation from lever arm times angle", by_sensors.rms, "nm"),
+        Number("fig9 steps: chi-square per degree of freedom", by_sensors.chi_square, "", tolerance=2.0),
+        Number("fig9 steps by the true angle: rms deviation", by_truth.rms, "nm"),
+        Number("fig9 steps by the true angle: chi-square", by_truth.chi_square, "", tolerance=2.0),
+        Number(label, float(rms(others)), "", tolerance=1.2),
     ]
-    rows = [
-        ("true", *(f"{v:.2f}" for v in VIEW_UM)),
-        ("from the steps", *(f"{v:.2f} +- {s:.2f}" for v, s in zip(lever.tolist(), spread.tolist(), strict=True))),
-    ]
+    rows = [("true", *cells(VIEW_UM, ".2f")), ("from the steps", *cells(lever, ".2f", spread))]
     tables = [Table("Lever arm", ("", "x, um", "y, um"), rows), _table(found, by_sensors), _budget(found)]
-    return Outcome(
-        "fig9", "Fig. 9: parasitic translation", [Picture("fig9", figure, caption)], tables, records, REMARKS
-    )
-
-
-def _rms(values: Tensor) -> float:
-    return float(values.square().mean().sqrt())
+    picture = Picture("fig9", draw(found, by_sensors, by_truth), caption)
+    return Experiment("fig9", "Fig. 9: parasitic translation", [picture], tables, records, REMARKS)
 
 
 def _table(found: Staircase, left: Deviations) -> Table:
     rows = []
-    for k, (d, s) in enumerate(zip(left.nm.tolist(), left.sigma.tolist(), strict=True), start=1):
+    for k, (nm, sigma) in enumerate(zip(left.nm, left.sigma, strict=True), start=1):
         x, y, theta = found.dwells["ECC"].mean[k].tolist()
-        cells = (f"{v:.1f} +- {e:.1f}" for v, e in zip(d, s, strict=True))
-        rows.append((f"{k}", f"{1e6 * theta:.0f}", f"{x:.4f}", f"{y:.4f}", *cells))
+        rows.append((f"{k}", f"{1e6 * theta:.0f}", f"{x:.4f}", f"{y:.4f}", *cells(nm, ".1f", sigma)))
     header = ("step", "theta, urad", "x, um", "y, um", "x minus the law, nm", "y minus the law, nm")
     return Table("Translation of each step by ECC, and its deviation from lever arm times angle", header, rows)
 
@@ -88,12 +70,12 @@ def _budget(found: Staircase) -> Table:
     """What sigma is made of."""
     cds = found.dwells["CDS"].mean[1:]
     causes = {
-        "scatter of the frames": scattered(found)[1:] + scattered(found)[0],
-        "sampler's aliasing": aliased(found)[1:].diagonal(dim1=1, dim2=2),
-        "sensors' non-linearity": sensed(cds).diagonal().reshape(-1, 2),
+        "scatter of the frames": parasitic.scattered(found)[1:] + parasitic.scattered(found)[0],
+        "sampler's aliasing": parasitic.aliased(found)[1:].diagonal(dim1=1, dim2=2),
+        "sensors' non-linearity": parasitic.sensed(cds).diagonal().reshape(-1, 2),
     }
     top = int(cds[:, 2].argmax())
-    rows = [(name, *(f"{v:.2f}" for v in variance[top].sqrt().tolist())) for name, variance in causes.items()]
+    rows = [(name, *cells(variance[top].sqrt(), ".2f")) for name, variance in causes.items()]
     return Table("Sigma of the deviation at the highest step by its causes", ("", "x, nm", "y, nm"), rows)
 
 
@@ -105,7 +87,7 @@ def draw(found: Staircase, by_sensors: Deviations, by_truth: Deviations) -> Figu
     time = track.time_s + found.alignment.offset_s
     top = int(found.levels_deg.argmax())
     turning = float(found.windows_s[top].mean())
-    law = predicted(sensors.pose)
+    law = parasitic.predicted(sensors.pose)
     for rows, colour, words in ((time < turning, UP, "ascent"), (time >= turning, DOWN, "descent")):
         plane.plot(*track.pose[rows, :2].T, ".", ms=2, color=colour, label=words)
     plane.plot(*law[::16].T, color=LAW, lw=0.8, label=r"lever arm x $\theta$ of CDS")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -11,10 +11,11 @@ from torch import Tensor
 
 from torch_ecc.core.align import align
 from torch_ecc.core.estimate import Estimate
+from torch_ecc.core.pose import retract
 from torch_ecc.core.reference import MARGIN, Reference, prepare
-from torch_ecc.paper.ref34 import Ref34
-
-PAPER_ITERATIONS = 15
+from torch_ecc.core.sampling import Sampler, make_sampler
+from torch_ecc.core.solver import warps
+from torch_ecc.paper.ref34 import PAPER_ITERATIONS, Ref34
 
 
 class Aligned:
@@ -27,8 +28,9 @@ class Aligned:
     iterations: Tensor
 
     def __init__(self, templates: Tensor, pose: Tensor, options: Mapping[str, Any], interpolation: str) -> None:
-        self.reference = prepared(templates, options)
         self.pose, self.interpolation = pose.clone(), interpolation
+        self.precompute = partial(prepared, templates, options)
+        self.reference = self.precompute()
 
     def track(self, frame: Tensor) -> Tensor:
         """Poses (R, 3) in the next frame."""
@@ -36,6 +38,15 @@ class Aligned:
         self.found = align(self.reference, frame, self.pose, **settings)
         self.pose, self.iterations = self.found.pose, self.found.iterations
         return self.pose
+
+    def sampler(self, image: Tensor, interpolation: str) -> Sampler:
+        """The sampler of frames (1 or R, 1, H, W), float32, around the present poses."""
+        return make_sampler(interpolation, image, warps(self.reference, self.pose), self.reference.box)
+
+    def iterate(self, sample: Sampler, reference: Reference) -> None:
+        """The bare iteration of Algorithm 1, lines 8 and 9: sample, step, update."""
+        g = sample(warps(reference, self.pose), reference.pixels)
+        self.pose = retract(self.pose, reference.criterion.step(reference, g).to(self.pose.dtype))
 
 
 def prepared(templates: Tensor, options: Mapping[str, Any]) -> Reference:
@@ -45,7 +56,9 @@ def prepared(templates: Tensor, options: Mapping[str, Any]) -> Reference:
     return prepare(templates, mask=mask, **options)
 
 
-Follower = Aligned | Ref34  # both have ``pose``, ``track`` and the ``iterations`` that the last frame took
+# Both have ``pose``, ``track`` and the ``iterations`` that the last frame took; ``iterate`` is one of these, with what
+# ``precompute`` returned and a ``sampler`` of the frame.
+Follower = Aligned | Ref34
 
 
 class Method(NamedTuple):
@@ -59,7 +72,7 @@ class Method(NamedTuple):
     def start(self, templates: Tensor, pose: Tensor, interpolation: str = "bspline3") -> Follower:
         """A follower of templates (R, 1, h + 2 MARGIN, w + 2 MARGIN) that are at poses (R, 3) now."""
         if self.options is None:
-            return Ref34(templates, pose, interpolation=interpolation, max_iterations=PAPER_ITERATIONS)
+            return Ref34(templates, pose, interpolation)
         return Aligned(templates, pose, self.options, interpolation)
 
 
@@ -71,14 +84,4 @@ METHODS: dict[str, Method] = {
     "ssd": Method("ssd", "#c8553d", "-", {"criterion": "ssd"}),
     "ref34": Method("ref. 34 (SSD, Hessian anew)", "#333333", ":", None),
 }
-
-
-def errors(pose: Tensor, truth: Tensor) -> Tensor:
-    """Pose minus truth, (..., 3) px, px, rad -> px, px, deg."""
-    return (pose - truth) * pose.new_tensor((1.0, 1.0, math.degrees(1.0)))
-
-
-def largest(error: Tensor) -> tuple[float, float]:
-    """Largest error (px, deg) of (..., 3) px, px, deg; px: the larger of x and y."""
-    x, y, theta = error.abs().flatten(0, -2).amax(0).tolist()
-    return max(x, y), theta
+COMPARED = ("linear", "gain", "ecc_paper", "ssd", "ref34")  # where more would show no more

@@ -15,9 +15,10 @@ from torch import Tensor
 from torch_ecc.core.pose import rotation
 from torch_ecc.core.verdict import interpolation_error
 from torch_ecc.paper.acquisition import tracker_of
+from torch_ecc.paper.errors import rms
 from torch_ecc.paper.steps import VIEW_UM, Staircase
 from torch_ecc.records.motion import Motion, dwell_errors
-from torch_ecc.sim.stage.sensors import Sensors, SensorSettings, nonlinear_modes
+from torch_ecc.sim import Sensors, SensorSettings, nonlinear_modes
 
 
 class Deviations(NamedTuple):
@@ -30,6 +31,11 @@ class Deviations(NamedTuple):
     def sigma(self) -> Tensor:
         """Standard deviations (K, 2) nm."""
         return self.covariance.diagonal().sqrt().reshape(-1, 2)
+
+    @property
+    def rms(self) -> float:
+        """Of x and y together, nm."""
+        return float(rms(self.nm.flatten()))
 
     @property
     def chi_square(self) -> float:

@@ -22,6 +22,9 @@ from torch_ecc.core.reference import MARGIN
 from torch_ecc.core.sampling import Sampler, blur, gradients, make_sampler
 from torch_ecc.core.solver import COARSE_TOLERANCE
 
+PAPER_ITERATIONS = 15  # at most, of every method
+TOLERANCE = 1e-3  # px at the template's corner
+
 
 def jacobian(gradient: Tensor, theta: Tensor) -> Tensor:
     """J(theta) (R, N, 3) of templates with ``gradient`` (R, 2, h, w) at angles (R,), eqs. (7), (8)."""
@@ -43,17 +46,8 @@ class Ref34:
     The samplers, the bilinear iterations first and the stop rule are those of the tracker.
     """
 
-    def __init__(
-        self,
-        templates: Tensor,
-        pose: Tensor,
-        *,
-        interpolation: str = "bspline3",
-        max_iterations: int = 15,
-        tolerance: float = 1e-3,
-    ) -> None:
+    def __init__(self, templates: Tensor, pose: Tensor, interpolation: str = "bspline3") -> None:
         self.pose, self.interpolation = pose.clone(), interpolation
-        self.max_iterations, self.tolerance = max_iterations, tolerance
         self.iterations = torch.zeros(len(pose), dtype=torch.int64)  # of the last frame
         inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
         self.gradient = gradients(blur(templates.float(), INSTRUMENT_BLUR))[inner].contiguous()
@@ -89,12 +83,12 @@ class Ref34:
     def track(self, frame: Tensor) -> Tensor:
         """Poses (R, 3) px, px, rad in the next frame (1 or R, 1, H, W)."""
         image, solve = frame.float(), self.precompute()
-        budget, self.iterations = self.max_iterations, torch.zeros_like(self.iterations)
-        if self.interpolation != "bilinear" and budget > 1:
+        budget, self.iterations = PAPER_ITERATIONS, torch.zeros_like(self.iterations)
+        if self.interpolation != "bilinear":
             coarse = budget * 2 // 3
-            self._stage(self.sampler(image, "bilinear"), solve, max(self.tolerance, COARSE_TOLERANCE), coarse)
+            self._stage(self.sampler(image, "bilinear"), solve, COARSE_TOLERANCE, coarse)
             budget -= coarse
-        self._stage(self.sampler(image, self.interpolation), solve, self.tolerance, budget)
+        self._stage(self.sampler(image, self.interpolation), solve, TOLERANCE, budget)
         return self.pose
 
     def _stage(self, sample: Sampler, solve: Tensor, tolerance: float, budget: int) -> None:

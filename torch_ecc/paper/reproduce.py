@@ -1,6 +1,7 @@
 """``torch-ecc reproduce``: run an experiment, keep what came out of it, and collect everything in one report.
 
-The experiment NAME is ``run(quick, advance) -> Outcome`` of the module torch_ecc.paper.NAME.
+The experiment NAME is ``run(quick, advance) -> Experiment`` of the module torch_ecc.paper.NAME, called in the pictures'
+style.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from typing import Any
 
 from torch_ecc.io.output import check_folder, part, publish
 from torch_ecc.paper.report import write_report
-from torch_ecc.paper.result import Advance, Outcome, environment, load_records, save_records
+from torch_ecc.paper.result import Advance, Experiment, environment, load_records, save_records
+from torch_ecc.plots.style import styled
 
 NAMES = ("fig2", "fig3", "fig4", "table1", *(f"fig{n}" for n in range(6, 14)), "robustness")
 RECORDS = "records.json"
@@ -34,7 +36,7 @@ def chosen(names: Sequence[str]) -> list[str]:
     return [name for name in NAMES if name in names or "all" in names]
 
 
-def run(name: str, out: str | Path, quick: bool, advance: Advance) -> Outcome:
+def run(name: str, out: str | Path, quick: bool, advance: Advance) -> Experiment:
     """Run the experiment ``name``; write out/name/*.png and records.json, and out/report.html anew.
 
     The report holds every experiment that was ever finished in ``out``. What is written is whole or not there at all:
@@ -43,26 +45,27 @@ def run(name: str, out: str | Path, quick: bool, advance: Advance) -> Outcome:
     folder = check_folder(out, "reproduce")
     chosen([name])
     started, worked = time.perf_counter(), time.process_time()
-    outcome: Outcome = import_module(f"torch_ecc.paper.{name}").run(quick, advance)
+    with styled():
+        experiment: Experiment = import_module(f"torch_ecc.paper.{name}").run(quick, advance)
     spent = {"seconds": time.perf_counter() - started, "cpu_seconds": time.process_time() - worked}
-    save(outcome, folder / name, {"quick": quick} | {key: round(value, 1) for key, value in spent.items()})
+    save(experiment, folder / name, {"quick": quick} | {key: round(value, 1) for key, value in spent.items()})
     written = [path for each in NAMES if (path := folder / each / RECORDS).is_file()]
     write_report(part(folder, "report.html"), written)
     publish(folder, "report.html")
-    return outcome
+    return experiment
 
 
-def save(outcome: Outcome, folder: Path, about: Mapping[str, Any]) -> None:
+def save(experiment: Experiment, folder: Path, about: Mapping[str, Any]) -> None:
     """Pictures and records of an experiment, in place of those of an earlier run.
 
     ``about`` holds how it was run: "quick", "seconds" and "cpu_seconds".
     """
     folder.mkdir(parents=True, exist_ok=True)
-    files = [f"{picture.name}.png" for picture in outcome.pictures]
-    for picture, file in zip(outcome.pictures, files, strict=True):
+    files = [f"{picture.name}.png" for picture in experiment.pictures]
+    for picture, file in zip(experiment.pictures, files, strict=True):
         picture.figure.savefig(part(folder, file), dpi=DPI, format="png")
     date = datetime.now().astimezone().isoformat(timespec="seconds")
-    save_records(outcome, part(folder, RECORDS), {**about, "date": date, "environment": environment()})
+    save_records(experiment, part(folder, RECORDS), {**about, "date": date, "environment": environment()})
     earlier = load_records(folder / RECORDS)["pictures"] if (folder / RECORDS).is_file() else []
     publish(folder, *files, RECORDS)
     for old in {picture["file"] for picture in earlier} - set(files):

@@ -6,8 +6,9 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,12 +16,17 @@ import kornia
 import matplotlib
 import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 
 Advance = Callable[[int, int], None]  # (done, total)
 
 
-class Record(NamedTuple):
-    """One number. ``better``: "lower" or "higher"; ``tolerance``: the limit it has to keep; ``paper``: the paper's."""
+class Number(NamedTuple):
+    """One number. ``better``: "lower" or "higher"; ``paper``: the paper's.
+
+    ``tolerance``: in an experiment the limit that the number has to keep; in a benchmark the share by which a later
+    one may be worse, None if it is only there to be read, as a peer's.
+    """
 
     name: str
     value: float
@@ -54,22 +60,28 @@ class Picture(NamedTuple):
     caption: str
 
 
-class Outcome(NamedTuple):
+class Experiment(NamedTuple):
     """Everything that came out of one experiment."""
 
     name: str
     title: str
     pictures: Sequence[Picture]
     tables: Sequence[Table]
-    records: Sequence[Record]
+    records: Sequence[Number]
     remarks: Sequence[str]
     seed: int = 0
 
 
 def counter(total: int, advance: Advance) -> Callable[[], None]:
-    """A function that advances by one of ``total`` every time it is called."""
-    done = iter(range(1, total + 1))
-    return lambda: advance(next(done), total)
+    """A function that advances by one of ``total`` every time it is called, and stays there if called more often."""
+    done = count(1)
+    return lambda: advance(min(next(done), total), total)
+
+
+def cells(values: Iterable[float] | Tensor, form: str, sigma: Tensor | None = None) -> list[str]:
+    """Numbers as a table shows them, with their standard deviations ``sigma`` where these are given."""
+    texts = [f"{value:{form}}" for value in (values.tolist() if isinstance(values, Tensor) else values)]
+    return texts if sigma is None else [f"{a} +- {b}" for a, b in zip(texts, cells(sigma, form), strict=True)]
 
 
 def environment() -> dict[str, str]:
@@ -93,27 +105,27 @@ def _processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def save_records(outcome: Outcome, path: Path, about: Mapping[str, Any]) -> None:
+def save_records(experiment: Experiment, path: Path, about: Mapping[str, Any]) -> None:
     """Everything of an experiment but its pixels as JSON, with what the numbers depend on (``about``).
 
     A number that is not finite is null; whether a number keeps its limit is said beside it.
     """
     document = {
-        "experiment": outcome.name,
-        "title": outcome.title,
-        "seed": outcome.seed,
+        "experiment": experiment.name,
+        "title": experiment.title,
+        "seed": experiment.seed,
         **about,
-        "pictures": [{"file": f"{picture.name}.png", "caption": picture.caption} for picture in outcome.pictures],
-        "tables": [table._asdict() for table in outcome.tables],
-        "remarks": list(outcome.remarks),
-        "records": [_row(record) for record in outcome.records],
+        "pictures": [{"file": f"{picture.name}.png", "caption": picture.caption} for picture in experiment.pictures],
+        "tables": [table._asdict() for table in experiment.tables],
+        "remarks": list(experiment.remarks),
+        "records": [_row(number) for number in experiment.records],
     }
     path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _row(record: Record) -> dict[str, Any]:
-    value = record.value if math.isfinite(record.value) else None
-    return {k: v for k, v in record._asdict().items() if v is not None} | {"value": value, "kept": record.kept}
+def _row(number: Number) -> dict[str, Any]:
+    value = number.value if math.isfinite(number.value) else None
+    return {k: v for k, v in number._asdict().items() if v is not None} | {"value": value, "kept": number.kept}
 
 
 def load_records(path: Path) -> dict[str, Any]:

@@ -7,33 +7,29 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table, counter
-from torch_ecc.paper.robustness_plot import Panel, draw_panels
+from torch_ecc.paper import trials
+from torch_ecc.paper.methods import METHODS
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells, counter
 from torch_ecc.paper.scheme import SIZE
-from torch_ecc.paper.trials import (
-    FOUND,
-    FRAME,
-    JUMP,
-    MIDDLE,
-    NOISE,
-    SEED,
-    TURN,
-    UNNOTICED,
-    Change,
-    Found,
-    camera,
-    sampler_errors,
-    sweep,
-)
-from torch_ecc.plots.style import styled
-from torch_ecc.sim.camera.occluder import Occluder
+from torch_ecc.paper.trials import FOUND, JUMP, NOISE, TURN, UNNOTICED, Change, Found, camera
+from torch_ecc.plots.style import letter, new_figure
+from torch_ecc.sim import Occluder
 
 COUNT = 48  # templates
 SAMPLERS = ("bilinear", "bspline3", "bspline5")
 ENOUGH = 0.9  # share of the templates
 MEAN = 128.0  # grey level that stays when contrast goes
+LOOKS = {  # of curves that are no METHODS: colour and dashes
+    "linear, 3 levels": ("#0b6e4f", "--"),
+    "linear, search": ("#0b6e4f", ":"),
+    UNNOTICED: ("#d62728", "-."),
+    "bilinear": ("#e69f00", "-"),
+    "bspline3": ("#0b6e4f", "-"),
+    "bspline5": ("#56b4e9", "--"),
+}
 
 
 class Sweep(NamedTuple):
@@ -45,10 +41,19 @@ class Sweep(NamedTuple):
     change: Callable[[float], Change]
 
 
+class Panel(NamedTuple):
+    """Curves y (n,) over x (n,) by name; ``log``: axes that are logarithmic, of "x" and "y"."""
+
+    title: str
+    labels: tuple[str, str]
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    log: str = ""
+
+
 def covered(share: float) -> Change:
     """Something dark in front of the camera covers that share of the template from one side, up to the jump."""
-    right = float(MIDDLE[0]) - SIZE / 2 + share * SIZE
-    occluder = Occluder(center=(right / 2 - 50, FRAME[0] / 2), half_size=(right / 2 + 50, FRAME[0]))
+    right = float(trials.MIDDLE[0]) - SIZE / 2 + share * SIZE
+    occluder = Occluder(center=(right / 2 - 50, trials.FRAME[0] / 2), half_size=(right / 2 + 50, trials.FRAME[0]))
     return Change(camera=camera(occluders=(occluder,) if share else ()))
 
 
@@ -92,26 +97,24 @@ REMARKS = (
 )
 
 
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Sweep and draw. ``quick``: a sixth of the templates, every other level."""
     count, step = (COUNT // 6, 2) if quick else (COUNT, 1)
     sweeps = {name: s._replace(levels=s.levels[::step]) for name, s in (BASIN | SWEEPS).items()}
     tick = counter(sum(len(s.levels) for s in sweeps.values()) + 2, advance)
-    found = {
-        name: sweep([s.change(v) for v in s.levels], count, tick, trackers=name in BASIN) for name, s in sweeps.items()
-    }
-    errors = {noise: sampler_errors(noise, count, SAMPLERS, tick) for noise in (0.0, NOISE)}
-    with styled():
-        pictures = [_basin(sweeps, found), *(_picture(name, sweeps[name], found[name]) for name in SWEEPS)]
-        pictures.append(_samplers(errors))
+    changes = {name: [s.change(v) for v in s.levels] for name, s in sweeps.items()}
+    found = {name: trials.sweep(c, count, tick, trackers=name in BASIN) for name, c in changes.items()}
+    errors = {noise: trials.sampler_errors(noise, count, SAMPLERS, tick) for noise in (0.0, NOISE)}
+    pictures = [_basin(sweeps, found), *(_picture(name, sweeps[name], found[name]) for name in SWEEPS)]
+    pictures.append(_samplers(errors))
     tables = [_table(sweeps, found, count), _sampler_table(errors)]
     records = [
-        Record(f"robustness {name}: {sweeps[name].label} up to which {ENOUGH:.0%} are found, {m}", limit, "1", better)
+        Number(f"robustness {name}: {sweeps[name].label} up to which {ENOUGH:.0%} are found, {m}", limit, "1", better)
         for name in sweeps
         for m, limit in limits(sweeps[name], found[name]).items()
         for better in ["lower" if name in ("contrast", "size") else "higher"]
     ]
-    return Outcome("robustness", "Robustness beyond the paper", pictures, tables, records, REMARKS, SEED)
+    return Experiment("robustness", "Robustness beyond the paper", pictures, tables, records, REMARKS, trials.SEED)
 
 
 def limits(swept: Sweep, found: Found) -> dict[str, float]:
@@ -124,13 +127,13 @@ def limits(swept: Sweep, found: Found) -> dict[str, float]:
     return result
 
 
-def _rates(title: str, swept: Sweep, found: Found, log: str = "") -> Panel:
+def _rates(swept: Sweep, found: Found, log: str = "") -> Panel:
     curves = {name: (swept.levels, rate) for name, rate in found.rate.items()}
-    return Panel(f"{title} templates found", (swept.label, "share of the templates"), curves, log)
+    return Panel("templates found", (swept.label, "share of the templates"), curves, log)
 
 
 def _basin(sweeps: Mapping[str, Sweep], found: Mapping[str, Found]) -> Picture:
-    panels = [_rates(f"({letter})", sweeps[name], found[name]) for letter, name in zip("ab", BASIN, strict=True)]
+    panels = [_rates(sweeps[name], found[name]) for name in BASIN]
     caption = (
         "Basin: how far the start may be from the answer, in (a) position and (b) angle. "
         '"3 levels" is a pyramid, "search" the tracker\'s default, which searches the frame.'
@@ -141,32 +144,43 @@ def _basin(sweeps: Mapping[str, Sweep], found: Mapping[str, Found]) -> Picture:
 def _picture(name: str, swept: Sweep, found: Found) -> Picture:
     log = "x" if name == "contrast" else ""
     errors = {m: (swept.levels, values) for m, values in found.error.items() if values}
-    panel = Panel("(b) error of those found", (swept.label, "median error at the corner (px)"), errors, log + "y")
+    panel = Panel("error of those found", (swept.label, "median error at the corner (px)"), errors, log + "y")
     caption = f"Over {swept.title}: (a) share of the templates found, (b) how exactly."
-    return Picture(name, draw_panels([_rates("(a)", swept, found, log), panel]), caption)
+    return Picture(name, draw_panels([_rates(swept, found, log), panel]), caption)
 
 
 def _samplers(errors: Mapping[float, Mapping[str, Tensor]]) -> Picture:
     panels = []
-    for letter, (noise, by_sampler) in zip("ab", errors.items(), strict=True):
-        curves = {
-            name: (values.tolist(), (torch.arange(1, len(values) + 1) / len(values)).tolist())
-            for name, values in by_sampler.items()
-        }
-        title = f"({letter}) noise of {noise:g} grey levels"
-        panels.append(Panel(title, ("error of x and y (px)", "share of the templates found"), curves, "x"))
+    for noise, by_sampler in errors.items():
+        curves = {name: (e.tolist(), ((torch.arange(len(e)) + 1) / len(e)).tolist()) for name, e in by_sampler.items()}
+        labels = ("error of x and y (px)", "share of the templates found")
+        panels.append(Panel(f"noise of {noise:g} grey levels", labels, curves, "x"))
     return Picture("sampler", draw_panels(panels), "Errors of the default method by sampler: share below.")
+
+
+def draw_panels(panels: Sequence[Panel]) -> Figure:
+    """The panels side by side with one legend below."""
+    figure = new_figure(11, 4.4)
+    grid = figure.subplots(1, len(panels))
+    handles = {}
+    for k, (axes, panel) in enumerate(zip(grid, panels, strict=True)):
+        for name, (x, y) in panel.curves.items():
+            colour, dashes = (METHODS[name].colour, METHODS[name].dashes) if name in METHODS else LOOKS[name]
+            marker = "." if len(x) < 20 else ""
+            (handles[name],) = axes.plot(x, y, dashes, marker=marker, color=colour)
+        axes.set(xlabel=panel.labels[0], ylabel=panel.labels[1], xscale="log" if "x" in panel.log else "linear")
+        axes.set(**({"yscale": "log"} if "y" in panel.log else {"ylim": (-0.03, 1.03)}))
+        letter(axes, f"({'ab'[k]}) {panel.title}")
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+    return figure
 
 
 def _table(sweeps: Mapping[str, Sweep], found: Mapping[str, Found], count: int) -> Table:
     names = list(found["jump"].rate)[:-1]
     rows = []
     for name, swept in sweeps.items():
-        limit = limits(swept, found[name])
-        cells = [
-            "none" if m in limit and math.isnan(limit[m]) else f"{limit[m]:g}" if m in limit else "" for m in names
-        ]
-        rows.append((swept.label, *cells, f"{max(found[name].rate[UNNOTICED]):.0%}"))
+        words = {m: "none" if math.isnan(v) else f"{v:g}" for m, v in limits(swept, found[name]).items()}
+        rows.append((swept.label, *(words.get(m, "") for m in names), f"{max(found[name].rate[UNNOTICED]):.0%}"))
     note = (
         f"{count} templates, levels as in the pictures. Last column: most, at any level, that the default method gave "
         "a wrong pose without noticing."
@@ -177,8 +191,7 @@ def _table(sweeps: Mapping[str, Sweep], found: Mapping[str, Found], count: int) 
 def _sampler_table(errors: Mapping[float, Mapping[str, Tensor]]) -> Table:
     rows = []
     for name in SAMPLERS:
-        levels = torch.tensor((0.5, 0.9), dtype=torch.float64)
-        cells = [f"{v:.4f}" for by_sampler in errors.values() for v in by_sampler[name].double().quantile(levels)]
-        rows.append((name, *cells))
+        shares = torch.tensor((0.5, 0.9), dtype=torch.float64)
+        rows.append((name, *cells(torch.cat([e[name].double().quantile(shares) for e in errors.values()]), ".4f")))
     header = ["sampler", *(f"{what}, noise {noise:g}" for noise in errors for what in ("median px", "9 of 10 below"))]
     return Table("Errors of x and y by sampler", header, rows, "Default method, position error.")

@@ -9,14 +9,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.core.pose import compose, inverse, rotation, transform
+from torch_ecc.core.pose import compose, inverse
 from torch_ecc.core.reference import MARGIN
-from torch_ecc.sim.camera.camera import Camera
-from torch_ecc.sim.camera.light import FieldLight, GradientLight, Lights, VignetteLight
-from torch_ecc.sim.camera.motion import harmonic, placed
-from torch_ecc.sim.scene.micrograph import micrograph
-from torch_ecc.sim.scene.retinex import Retinex, single_scale
-from torch_ecc.sim.scene.scene import Scene
+from torch_ecc.sim import (
+    Camera,
+    FieldLight,
+    GradientLight,
+    Lights,
+    Retinex,
+    Scene,
+    VignetteLight,
+    harmonic,
+    micrograph,
+    placed,
+    single_scale,
+)
 
 SIZE = 121  # px, side of the paper's template
 FRAME = (480, 640)  # (h, w) px
@@ -27,41 +34,45 @@ SURROUND = 150.0  # px, Gaussian of the Retinex surround: wider than any block o
 
 
 @dataclass(frozen=True)
-class Motion:
+class Harmonic:
     """Eq. (11): ``amplitude`` px in x and y and ``degrees`` in theta, ``points`` in a cycle."""
 
-    amplitude: float
-    degrees: float
-    points: int
+    amplitude: float = 20.0
+    degrees: float = 5.0
+    points: int = 40
 
-    def path(self) -> Tensor:
-        """Poses (points, 3) px, px, rad of the scene about the middle of the frame."""
+    def path(self, size: tuple[int, int] = FRAME) -> Tensor:
+        """Poses (points, 3) px, px, rad of the scene about the middle of a frame (h, w)."""
         turn = math.radians(self.degrees)
-        return placed(harmonic((self.amplitude, self.amplitude, turn), self.points), CENTRE)
+        return placed(harmonic((self.amplitude, self.amplitude, turn), self.points), (size[1] / 2, size[0] / 2))
+
+    def closed(self, size: tuple[int, int] = FRAME) -> Tensor:
+        """The same (points + 1, 3), begun with the pose that they end with."""
+        path = self.path(size)
+        return torch.cat((path[-1:], path))
 
     def __str__(self) -> str:
         return f"{self.amplitude:g} px, {self.degrees:g} deg, Nop {self.points}"
 
 
-TEXT = Motion(100.0, 20.0, 160)  # as the text has it
-CAPTION = Motion(100.0, 12.0, 200)  # as the caption of Fig. 2 has it
+TEXT = Harmonic(100.0, 20.0, 160)  # as the text has it
+CAPTION = Harmonic(100.0, 12.0, 200)  # as the caption of Fig. 2 has it
 
 
 class Cut(NamedTuple):
-    """Where templates are cut: ``pose`` (3,) of the scene in the image they are cut from, and their own ``start``
-    (3,) in that image, upright and on whole pixels."""
+    """Where templates are cut: ``pose`` (3,), of many images (F, 3), of the scene in the image they are cut from, and
+    their own ``start`` (3,) in that image, upright and on whole pixels."""
 
     pose: Tensor
     start: Tensor
 
     def truth(self, path: Tensor) -> Tensor:
         """Exact poses (F, 3) of the template when the scene moves along ``path`` (F, 3)."""
-        own = compose(inverse(self.pose), self.start)
-        return compose(path, own.expand_as(path))
+        return compose(path, self.place().expand_as(path))
 
-    def seen(self, scene: Scene) -> Turned:
-        """``scene`` in the template's own coordinates."""
-        return Turned(scene, compose(inverse(self.pose), self.start))
+    def place(self) -> Tensor:
+        """Poses of the templates in the scene, (3,) or (F, 3) as ``pose`` is."""
+        return compose(inverse(self.pose), self.start.expand_as(self.pose))
 
     def template(self, image: Tensor, size: int = SIZE) -> Tensor:
         """The template (..., size + 2 MARGIN, size + 2 MARGIN) of images (..., h, w), with its surroundings."""
@@ -99,22 +110,6 @@ def components() -> Retinex:
 def uneven_light() -> FieldLight:
     """The incident component of the original as the light of a sequence: it stays with the camera."""
     return FieldLight(components().incident[0, 0])
-
-
-@dataclass(frozen=True, eq=False)
-class Turned:
-    """A scene in the coordinates of something that lies in it at ``pose`` (3,); for the Cramer-Rao bound."""
-
-    scene: Scene
-    pose: Tensor
-
-    def value(self, points: Tensor) -> Tensor:
-        """(..., 2) -> (...)."""
-        return self.scene.value(transform(self.pose, points))
-
-    def gradient(self, points: Tensor) -> Tensor:
-        """(..., 2) -> (..., 2): along the own axes."""
-        return self.scene.gradient(transform(self.pose, points)) @ rotation(self.pose[2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from torch_ecc.commands.servo_job import Run, ServoJob, prepare_parts, run_alignment, setting
+from torch_ecc.paper.errors import in_degrees
+from torch_ecc.paper.result import cells
 from torch_ecc.servo.detect import find
 from torch_ecc.servo.loop import servo
 from torch_ecc.servo.record import Ending, Log, Result
@@ -63,6 +65,12 @@ def trial(values: Mapping[str, Any]) -> Trial:
         max(u[0] for u in used),
         max(u[1] for u in used),
     )
+
+
+def error_cells(error: Tensor) -> list[str]:
+    """An error (3,) px, px, rad as a table shows it."""
+    x, y, theta = in_degrees(error).tolist()
+    return [*cells((x, y), ".3f"), *cells((theta,), ".4f")]
 
 
 def shares(log: Log, stage: MultiAxisStage, period: float) -> tuple[float, float]:

@@ -6,19 +6,27 @@ Simulated once for all four figures.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_ecc.paper.acquisition import COMMAND_HZ, ON_TABLE, Acquisition, Bench, acquire, frames_of, zeroed
-from torch_ecc.paper.result import Advance
+from torch_ecc.paper.acquisition import (
+    COMMAND_HZ,
+    Acquisition,
+    Bench,
+    acquire,
+    frames_of,
+    microscope,
+    simulated_once,
+    zeroed,
+)
+from torch_ecc.paper.result import Advance, Table, cells, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Dwells, Motion, dwell_errors
 from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
-from torch_ecc.sim.camera.light import GradientLight, LampDrift, Lights
-from torch_ecc.sim.stage.microscope import Microscope
+from torch_ecc.sim import GradientLight, LampDrift, Lights
 
 STEP_DEG, HIGHEST = 0.04, 6
 LEVELS = (*range(HIGHEST + 1), *range(HIGHEST - 1, -1, -1))  # in steps
@@ -28,6 +36,13 @@ LAMP = 0.2  # of its light that the lamp gains in the first half of the staircas
 GAIN = 0.8  # of the camera, so that nothing is clipped at that
 SETTLE_S = 0.15  # after which a dwell is counted
 METHODS = {"ECC": {}, "ECC, gain": {"illumination": "gain"}, "SSD": {"criterion": "ssd"}}
+
+
+def step_table(title: str, levels_deg: Tensor, columns: Mapping[str, Tensor], first: int = 0) -> Table:
+    """Angles (K,) in deg by name beside those commanded at steps ``first``, ``first`` + 1, ..."""
+    values = zip(levels_deg.tolist(), *(column.tolist() for column in columns.values()), strict=True)
+    rows = [(f"{k}", f"{level:.2f}", *cells(row, ".5f")) for k, (level, *row) in enumerate(values, first)]
+    return Table(title, ("step", "commanded", *columns), rows)
 
 
 class Staircase(NamedTuple):
@@ -47,19 +62,10 @@ class Staircase(NamedTuple):
     windows_s: Tensor
     calibration: Calibration
 
-    def absolute_errors(self, method: str) -> Tensor:
-        """The paper's absolute errors (K, 3) um, um, rad: the mean of each step minus that of the CDS."""
-        return self.dwells[method].mean - self.dwells["CDS"].mean
-
-
-_kept: dict[bool, Staircase] = {}
-
-
-def staircase(quick: bool, advance: Advance) -> Staircase:
-    """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
-    if quick not in _kept:
-        _kept[quick] = _run(0.3 if quick else 3.0, (240, 320) if quick else (480, 640), advance)
-    return _kept[quick]
+    def mean_deg(self, method: str) -> Tensor:
+        """Mean theta (K,) in deg of each step."""
+        theta: Tensor = self.dwells[method].mean[:, 2].rad2deg()
+        return theta
 
 
 def command(dwell_s: float) -> Tensor:
@@ -69,20 +75,17 @@ def command(dwell_s: float) -> Tensor:
     return torch.stack((0 * turn, 0 * turn, turn), -1)
 
 
-def _run(dwell_s: float, region: tuple[int, int], advance: Advance) -> Staircase:
-    microscope = Microscope(zoom=ZOOM, region_px=region, view_um=VIEW_UM, **ON_TABLE)
-    bench, path = Bench(microscope=microscope, methods=METHODS), command(dwell_s)
-    total, done = frames_of(path, bench), 0
-    bench = replace(bench, gain=GAIN, light=Lights((GradientLight(), LampDrift(LAMP, period=2.2 * total))))
-
-    def tick() -> None:
-        nonlocal done
-        done += 1
-        advance(min(done, total), total)
-
-    acquired = acquire(path, bench, tick)
-    angle, rest = microscope.axis_angle, dwell_s / 4  # the angle is known from the circles
-    turn, calibration = Calibration(1.0, angle), Calibration(microscope.um_per_px, angle)
+@simulated_once
+def staircase(quick: bool, advance: Advance) -> Staircase:
+    """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
+    dwell_s = 0.3 if quick else 3.0
+    view, path = microscope(quick, zoom=ZOOM, view_um=VIEW_UM), command(dwell_s)
+    frames = frames_of(path, Bench(microscope=view))
+    light = Lights((GradientLight(), LampDrift(LAMP, period=2.2 * frames)))
+    bench = Bench(microscope=view, methods=METHODS, gain=GAIN, light=light)
+    acquired = acquire(path, bench, counter(frames, advance))
+    angle, rest = view.axis_angle, dwell_s / 4  # the angle is known from the circles
+    turn, calibration = Calibration(1.0, angle), Calibration(view.um_per_px, angle)
     sensors = zeroed(acquired.sensors, rest)
     tracks = {name: zeroed(Motion(m.time_s, turn.to_physical(m.pose)), rest) for name, m in acquired.tracks.items()}
     unknowns = Unknowns(angle=False, lever=True, max_offset_s=0.5)

@@ -7,38 +7,38 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from statistics import median, quantiles
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ecc.core.pose import retract
-from torch_ecc.core.reference import Reference
-from torch_ecc.core.sampling import Sampler, make_sampler
-from torch_ecc.core.solver import warps
+from torch_ecc.core.sampling import Sampler
 from torch_ecc.paper import scheme
-from torch_ecc.paper.methods import METHODS, PAPER_ITERATIONS, Follower, prepared
-from torch_ecc.paper.ref34 import Ref34
-from torch_ecc.paper.result import Advance, Outcome, Picture, Record, Table
-from torch_ecc.plots.style import letter, new_figure, styled
-from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.paper.methods import METHODS, Follower
+from torch_ecc.paper.ref34 import PAPER_ITERATIONS
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
+from torch_ecc.plots.style import letter, new_figure
+from torch_ecc.sim import Camera
 
 ROUNDS, ITERATIONS = 120, 10  # rounds of all methods in turn; iterations timed at once
 FRAMES = 20  # pairs of neighbouring frames of the text's motion, for the iterations that occur
-SAMPLERS = ("bilinear", "bspline3")  # of the first iterations and of the last ones
-PAPER = {"gain": (9.9, 3.6), "ref34": (7.5, 3.3)}  # ms: t_pre, t_it of Table I
+T_PRE, T_IT, WHOLE = "t_pre", "t_it, bspline3", "whole frame"
+WORKS = (T_PRE, "t_it, bilinear", T_IT, WHOLE)  # what is timed; bilinear are the first iterations of a frame
+PAPER = {"gain": {T_PRE: 9.9, T_IT: 3.6}, "ref34": {T_PRE: 7.5, T_IT: 3.3}}  # ms, Table I
 PAPER_CROSSOVER = 25
 LONGEST = 30  # iterations on the axis of the picture
 
 
 class Times(NamedTuple):
-    """Milliseconds of every round, those of an iteration by sampler; and the iterations that each frame took."""
+    """Milliseconds of every round of each of the ``WORKS``, and the iterations that each frame took."""
 
-    precomputation: list[float]
-    iteration: dict[str, list[float]]
-    frame: list[float]
+    ms: dict[str, list[float]]
     iterations: list[int]
+
+    def median(self, work: str) -> float:
+        """Of all rounds, ms."""
+        return median(self.ms[work])
 
     @property
     def mean_iterations(self) -> float:
@@ -46,16 +46,7 @@ class Times(NamedTuple):
         return sum(self.iterations) / len(self.iterations)
 
 
-class Task(NamedTuple):
-    """What is timed of a method, and its follower."""
-
-    precompute: Callable[[], object]
-    iterate: dict[str, Callable[[], None]]
-    frame: Callable[[], None]
-    follower: Follower
-
-
-def run(quick: bool, advance: Advance) -> Outcome:
+def run(quick: bool, advance: Advance) -> Experiment:
     """Time all methods in turn on one thread. ``quick``: a quarter of the rounds and of the frames."""
     threads, share = torch.get_num_threads(), 4 if quick else 1
     torch.set_num_threads(1)
@@ -63,14 +54,12 @@ def run(quick: bool, advance: Advance) -> Outcome:
         times = measure(ROUNDS // share, FRAMES // share, advance)
     finally:
         torch.set_num_threads(threads)
-    with styled():
-        figure = draw(times)
     caption = (
         "Time per frame over the number of iterations K, less that of ref. 34, which pays its precomputation at every "
         "frame: below zero ref. 34 is slower. (a) here, B-spline iterations; (b) from the paper's Table I."
     )
-    picture = Picture("table1", figure, caption)
-    return Outcome("table1", "Table I: time", [picture], [_table(times)], _records(times), _remarks(times))
+    picture = Picture("table1", draw(times), caption)
+    return Experiment("table1", "Table I: time", [picture], [_table(times)], _records(times), _remarks(times))
 
 
 def measure(rounds: int, frames: int, advance: Advance) -> dict[str, Times]:
@@ -82,55 +71,38 @@ def measure(rounds: int, frames: int, advance: Advance) -> dict[str, Times]:
     )
     template, truth = cut.template(images[:1]), cut.truth(path)
     fast = frames // 2  # where the motion is fastest
-    tasks = {name: _task(name, template, truth[starts[[fast]]], images[[fast + 1]]) for name in METHODS}
-    found = {name: Times([], {s: [] for s in SAMPLERS}, [], []) for name in METHODS}
+    followers = {name: method.start(template, truth[starts[[fast]]]) for name, method in METHODS.items()}
+    works = {name: _works(follower, images[[fast + 1]]) for name, follower in followers.items()}
+    found = {name: Times({work: [] for work in WORKS}, []) for name in METHODS}
     for k in range(rounds + 1):
-        for name, task in tasks.items():
-            row = (_ms(task.precompute), _ms(task.frame), *(_ms(task.iterate[s]) / ITERATIONS for s in SAMPLERS))
-            columns = (found[name].precomputation, found[name].frame, *found[name].iteration.values())
-            for column, value in zip(columns, row, strict=True):
-                column.extend([value] * (k > 0))
+        for name in METHODS:
+            for work, call in works[name].items():
+                found[name].ms[work].extend([_ms(call) / (ITERATIONS if "t_it" in work else 1)] * (k > 0))
         advance(k, rounds)
-    for name, task in tasks.items():
+    for name, follower in followers.items():
         for image, start in zip(images[1:].split(1), truth[starts].split(1), strict=True):
-            task.follower.pose = start
-            task.follower.track(image)
-            found[name].iterations.append(int(task.follower.iterations[0]))
+            follower.pose = start
+            follower.track(image)
+            found[name].iterations.append(int(follower.iterations[0]))
     return found
 
 
-def _task(name: str, template: Tensor, start: Tensor, image: Tensor) -> Task:
-    """One template (1, 1, ...), the frame (1, 1, H, W) after the one that it is at ``start`` (1, 3) in."""
-    follower = METHODS[name].start(template, start)
-    precompute: Callable[[], object]
-    if isinstance(follower, Ref34):
-        precompute, solve = follower.precompute, follower.precompute()
-        samplers = {s: follower.sampler(image.float(), s) for s in SAMPLERS}
-        loop: Callable[[Sampler], None] = partial(_loop_ref34, follower, start, solve)
-    else:
-        reference = follower.reference
-        precompute = partial(prepared, template, METHODS[name].options or {})
-        samplers = {s: make_sampler(s, image.float(), warps(reference, start), reference.box) for s in SAMPLERS}
-        loop = partial(_loop, reference, start)
+def _works(follower: Follower, image: Tensor) -> dict[str, Callable[[], object]]:
+    """What is timed of a method that is where its template was in the frame before ``image`` (1, 1, H, W)."""
+    start, constants = follower.pose, cast("Any", follower.precompute())
+    bilinear, bspline3 = (follower.sampler(image.float(), name) for name in ("bilinear", "bspline3"))
+
+    def loop(sample: Sampler) -> None:
+        follower.pose = start
+        for _ in range(ITERATIONS):
+            follower.iterate(sample, constants)
 
     def frame() -> None:
         follower.pose = start
         follower.track(image)
 
-    return Task(precompute, {s: partial(loop, samplers[s]) for s in SAMPLERS}, frame, follower)
-
-
-def _loop(reference: Reference, pose: Tensor, sample: Sampler) -> None:
-    """The bare iterations of Algorithm 1, lines 8 and 9: sample, step, update."""
-    for _ in range(ITERATIONS):
-        g = sample(warps(reference, pose), reference.pixels)
-        pose = retract(pose, reference.criterion.step(reference, g).to(pose.dtype))
-
-
-def _loop_ref34(follower: Ref34, pose: Tensor, solve: Tensor, sample: Sampler) -> None:
-    follower.pose = pose
-    for _ in range(ITERATIONS):
-        follower.iterate(sample, solve)
+    calls = (follower.precompute, partial(loop, bilinear), partial(loop, bspline3), frame)
+    return dict(zip(WORKS, calls, strict=True))
 
 
 def _ms(work: Callable[[], object]) -> float:
@@ -143,21 +115,19 @@ def _ms(work: Callable[[], object]) -> float:
 
 def slower(ours: Times, other: Times) -> float:
     """How much longer our B-spline iteration takes, ms: the median of the differences within a round."""
-    pairs = zip(ours.iteration["bspline3"], other.iteration["bspline3"], strict=True)
-    return median(a - b for a, b in pairs)
+    return median(a - b for a, b in zip(ours.ms[T_IT], other.ms[T_IT], strict=True))
 
 
 def crossover(ours: Times, other: Times) -> float:
     """K beyond which recomputing at every frame would be faster: K t_it = t_pre' + K t_it'; infinite if never."""
     difference = slower(ours, other)
-    return median(other.precomputation) / difference if difference > 0 else math.inf
+    return other.median(T_PRE) / difference if difference > 0 else math.inf
 
 
 def per_frame(times: dict[str, Times], name: str) -> float:
     """The paper's formula (Table I, last column) at the mean K that the method itself needs, ms."""
-    t = times[name]
-    once = median(t.precomputation) if name == "ref34" else 0.0
-    return once + t.mean_iterations * median(t.iteration["bspline3"])
+    once = times[name].median(T_PRE) if name == "ref34" else 0.0
+    return once + times[name].mean_iterations * times[name].median(T_IT)
 
 
 def draw(times: dict[str, Times]) -> Figure:
@@ -168,9 +138,10 @@ def draw(times: dict[str, Times]) -> Figure:
     for name, t in times.items():
         style = METHODS[name]
         if name != "ref34":
-            less = K * slower(t, other) - median(other.precomputation)
+            less = K * slower(t, other) - other.median(T_PRE)
             left.plot(K, less, style.dashes, color=style.colour, label=style.label)
-    right.plot(K, K * (PAPER["gain"][1] - PAPER["ref34"][1]) - PAPER["ref34"][0], color=METHODS["gain"].colour)
+    ours, theirs = PAPER["gain"], PAPER["ref34"]
+    right.plot(K, K * (ours[T_IT] - theirs[T_IT]) - theirs[T_PRE], color=METHODS["gain"].colour)
     occur = times["linear"].iterations
     left.axvspan(min(occur), max(occur), color="#eeeeee", label="K of ecc, linear, that occur")
     right.axvline(PAPER_ITERATIONS, color="0.6", lw=0.8)
@@ -188,70 +159,63 @@ def _spread(values: Sequence[float]) -> str:
     return f"{middle:.3f} ({low:.3f} to {high:.3f})"
 
 
-def _beyond(K: float) -> str:
-    return "never" if math.isinf(K) else f"{K:.0f}"
-
-
 def _table(times: dict[str, Times]) -> Table:
     rows = []
     for name, t in times.items():
         formula = "t_pre + K t_it" if name == "ref34" else "K t_it"
-        cells = [_spread(values) for values in (t.precomputation, *t.iteration.values(), t.frame)]
         occur = f"{t.mean_iterations:.1f} ({max(t.iterations)})"
-        rows.append((METHODS[name].label, *cells, formula, occur, "" if name == "ref34" else _cross(times, name)))
+        cross = "" if name == "ref34" else _cross(times, name)
+        rows.append((METHODS[name].label, *map(_spread, t.ms.values()), formula, occur, cross))
     rows.append(("paper, proposed (MATLAB)", "9.9", "", "3.6", "", "K t_it", "at most 15", str(PAPER_CROSSOVER)))
     rows.append(("paper, ref. 34 (MATLAB)", "7.5", "", "3.3", "", "t_pre + K t_it", "at most 15", ""))
     header = ("method", "t_pre", "t_it, bilinear", "t_it, B-spline", "whole frame", "per frame", "K mean (most)", "K*")
     note = (
-        f"Milliseconds of one thread: median (quartiles) of {len(times['ref34'].frame)} rounds, methods in turn in one "
-        "process, 121x121 px. t_it: sample, step and update. Whole frame: from the frame to the pose, with preparation "
-        "of the sampler, both stages and, but for ref. 34, score, status and covariance. K: iterations that occur "
-        "along the text's motion. K*: beyond it ref. 34 would be faster."
+        f"Milliseconds of one thread: median (quartiles) of {len(times['ref34'].ms[WHOLE])} rounds, methods in turn in "
+        "one process, 121x121 px. t_it: sample, step and update. Whole frame: from the frame to the pose, with "
+        "preparation of the sampler, both stages and, but for ref. 34, score, status and covariance. K: iterations "
+        "that occur along the text's motion. K*: beyond it ref. 34 would be faster."
     )
     return Table("Table I: time of precomputation and iteration", header, rows, note)
 
 
 def _cross(times: dict[str, Times], name: str) -> str:
-    return _beyond(crossover(times[name], times["ref34"]))
+    K = crossover(times[name], times["ref34"])
+    return "never" if math.isinf(K) else f"{K:.0f}"
 
 
-def _records(times: dict[str, Times]) -> list[Record]:
+def _records(times: dict[str, Times]) -> list[Number]:
     records = []
     for name, t in times.items():
-        paper = PAPER.get(name, (None, None))
+        paper = PAPER.get(name, {})
+        records += [Number(f"table1 {name}, {work}", t.median(work), "ms", paper=paper.get(work)) for work in WORKS]
         records += [
-            Record(f"table1 {name}, t_pre", median(t.precomputation), "ms", paper=paper[0]),
-            Record(f"table1 {name}, t_it, bspline3", median(t.iteration["bspline3"]), "ms", paper=paper[1]),
-            Record(f"table1 {name}, t_it, bilinear", median(t.iteration["bilinear"]), "ms"),
-            Record(f"table1 {name}, whole frame", median(t.frame), "ms"),
-            Record(f"table1 {name}, mean K", t.mean_iterations, "iterations"),
-            Record(f"table1 {name}, per frame by the paper's formula at its mean K", per_frame(times, name), "ms"),
+            Number(f"table1 {name}, mean K", t.mean_iterations, "iterations"),
+            Number(f"table1 {name}, per frame by the paper's formula at its mean K", per_frame(times, name), "ms"),
         ]
         if name != "ref34":
             most = float(max(t.iterations))
             paper_K = float(PAPER_CROSSOVER) if name == "gain" else None
             label = f"table1 {name}, K beyond which ref34 is faster (limit: the largest K that occurs)"
-            records.append(Record(label, crossover(t, times["ref34"]), "iterations", "higher", most, paper_K))
+            records.append(Number(label, crossover(t, times["ref34"]), "iterations", "higher", most, paper_K))
     return records
 
 
 def _remarks(times: dict[str, Times]) -> list[str]:
     ours, other = times["linear"], times["ref34"]
-    step, step34 = (median(t.iteration["bspline3"]) for t in (ours, other))
     pays = "pays" if crossover(ours, other) >= max(ours.iterations) else "does not pay"
     return [
         "The paper's argument holds here too, with other numbers: an iteration of ECC costs a little more than one of "
-        f"SSD ({step:.2f} against {step34:.2f} ms), and the precomputation that ref. 34 repeats at every frame "
-        f"({median(other.precomputation):.2f} ms) outweighs that up to K = {_cross(times, 'linear')} (paper: "
-        f"{PAPER_CROSSOVER}). Of the {PAPER_ITERATIONS} iterations allowed, ecc needs {ours.mean_iterations:.1f} on "
-        f"average and {max(ours.iterations)} at most along the text's motion, ref. 34 {other.mean_iterations:.1f} and "
-        f"{max(other.iterations)}: at equal K precomputing {pays} at every K that occurs. "
-        "With its own K put into the paper's formulas, a frame takes "
+        f"SSD ({ours.median(T_IT):.2f} against {other.median(T_IT):.2f} ms), and the precomputation that ref. 34 "
+        f"repeats at every frame ({other.median(T_PRE):.2f} ms) outweighs that up to K = {_cross(times, 'linear')} "
+        f"(paper: {PAPER_CROSSOVER}). Of the {PAPER_ITERATIONS} iterations allowed, ecc needs "
+        f"{ours.mean_iterations:.1f} on average and {max(ours.iterations)} at most along the text's motion, ref. 34 "
+        f"{other.mean_iterations:.1f} and {max(other.iterations)}: at equal K precomputing {pays} at every K that "
+        "occurs. With its own K put into the paper's formulas, a frame takes "
         f"{per_frame(times, 'linear'):.1f} ms with ecc and {per_frame(times, 'ref34'):.1f} ms with ref. 34.",
         "The baseline is given no idle work: the gradient of its template is taken once, and what it repeats is "
         "J(theta), the Hessian and its inverse only. That is why its precomputation is so much smaller than ours, "
         "which also estimates the template's noise and everything that covariances need, once.",
-        f"A whole frame takes {median(ours.frame):.1f} ms with ecc (linear) and {median(other.frame):.1f} ms with "
+        f"A whole frame takes {ours.median(WHOLE):.1f} ms with ecc (linear) and {other.median(WHOLE):.1f} ms with "
         "ref. 34. Beside its iterations ecc judges what it found: score, status, covariance; ref. 34 delivers a pose "
         "alone.",
         "The paper's times are MATLAB's on another machine: compare the ratios. The light models (linear, quadratic) "

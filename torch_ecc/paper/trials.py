@@ -13,9 +13,10 @@ from torch import Tensor
 
 from torch_ecc.core.estimate import Status
 from torch_ecc.core.pose import compose
-from torch_ecc.paper.methods import METHODS, Aligned, Follower, errors
+from torch_ecc.paper.errors import errors
+from torch_ecc.paper.methods import COMPARED, METHODS, Aligned, Follower
 from torch_ecc.paper.scheme import SIZE, Cut, Kept, scene
-from torch_ecc.sim.camera.camera import Camera
+from torch_ecc.sim import Camera
 from torch_ecc.track.tracker import AT_ONCE, Tracker
 
 FRAME = (320, 320)  # (h, w) px
@@ -24,7 +25,6 @@ REACH = 1000.0  # px of the square on the micrograph that templates are drawn fr
 BORDER = 24  # px rendered around a frame, for its blur
 FOUND = 0.5  # px at the template's corner: a template nearer than that is found
 JUMP, TURN, NOISE = 2.0, 1.0, 2.0  # px, deg and grey levels, where they are not what is varied
-METHODS_USED = ("linear", "gain", "ecc_paper", "ssd", "ref34")
 TRACKERS: dict[str, dict[str, Any]] = {  # the default method with what is in reserve
     "linear, 3 levels": {"levels": 3, "search": False},
     "linear, search": {"search": True},
@@ -56,49 +56,43 @@ class Found(NamedTuple):
     error: dict[str, list[float]]
 
 
-class Pairs(NamedTuple):
-    """B scene poses in the first and in the second frame, and the templates' true poses in the second, (B, 3) each."""
+def pairs(count: int, jump: float, turn: float) -> tuple[Cut, Tensor]:
+    """Where B = ``count`` templates are cut, and poses (B, 3) of the scene in their next frames.
 
-    first: Tensor
-    second: Tensor
-    truth: Tensor
-
-
-def pairs(count: int, jump: float, turn: float) -> Pairs:
-    """The same ``count`` places, angles and directions for every ``jump`` (px) and ``turn`` (deg)."""
+    The same places, angles and directions for every ``jump`` (px) and ``turn`` (deg).
+    """
     source = torch.Generator().manual_seed(SEED)
     x, y, angle, way, sign = torch.rand(5, count, generator=source, dtype=torch.float64)
     place = torch.stack((REACH * (x - 0.5), REACH * (y - 0.5), math.tau * angle), -1)
     side = torch.where(sign < 0.5, -1.0, 1.0)
     way = math.tau * way
     move = torch.stack((jump * way.cos(), jump * way.sin(), math.radians(turn) * side), -1)
-    truth = MIDDLE + move
-    return Pairs(compose(MIDDLE.expand_as(place), place), compose(truth, place), truth)
+    return Cut(compose(MIDDLE.expand_as(place), place), MIDDLE), compose(MIDDLE + move, place)
 
 
 @lru_cache(maxsize=1)
 def _rendered(count: int, jump: float, turn: float) -> Kept:
     """The second frames without what the camera does to them, and with a border."""
-    second = pairs(count, jump, turn).second + torch.tensor((BORDER, BORDER, 0.0), dtype=torch.float64)
+    second = pairs(count, jump, turn)[1] + torch.tensor((BORDER, BORDER, 0.0), dtype=torch.float64)
     return Kept(scene(), scene().render(second, (FRAME[0] + 2 * BORDER, FRAME[1] + 2 * BORDER)))
 
 
 def sweep(changes: Sequence[Change], count: int, tick: Callable[[], None], *, trackers: bool = False) -> Found:
     """All methods, with ``trackers`` also those, over changes that make one thing worse and worse."""
-    names = [*METHODS_USED, *(TRACKERS if trackers else ())]
+    names = [*COMPARED, *(TRACKERS if trackers else ())]
     found = Found({name: [] for name in (*names, UNNOTICED)}, {name: [] for name in names})
-    first = camera().capture(scene(), pairs(count, 0, 0).first, seed=SEED)
+    first = camera().capture(scene(), pairs(count, 0, 0)[0].pose, seed=SEED)
     prepared: dict[int, dict[str, Follower]] = {}
     for change in changes:
-        both = pairs(count, change.jump, change.turn)
-        frames = change.camera.capture(_rendered(count, change.jump, change.turn), both.second, seed=SEED + 1)
+        cut, second = pairs(count, change.jump, change.turn)
+        frames = change.camera.capture(_rendered(count, change.jump, change.turn), second, seed=SEED + 1)
         if change.size not in prepared:
             prepared[change.size] = _prepare(first, change.size)
         poses, believed = _track(prepared[change.size], frames)
         if trackers:
             more, believed = _track_once(first, frames, change.size)
             poses |= more
-        errors = {name: corner_error(pose, both.truth, change.size) for name, pose in poses.items()}
+        errors = {name: corner_error(pose, cut.truth(second), change.size) for name, pose in poses.items()}
         for name, error in errors.items():
             good = error < FOUND
             found.rate[name].append(float(good.double().mean()))
@@ -111,7 +105,7 @@ def sweep(changes: Sequence[Change], count: int, tick: Callable[[], None], *, tr
 
 def _prepare(first: Tensor, size: int) -> dict[str, Follower]:
     template = Cut(MIDDLE, MIDDLE).template(first, size)
-    return {name: METHODS[name].start(template, MIDDLE.expand(len(first), 3)) for name in METHODS_USED}
+    return {name: METHODS[name].start(template, MIDDLE.expand(len(first), 3)) for name in COMPARED}
 
 
 def _track(followers: Mapping[str, Follower], frames: Tensor) -> tuple[dict[str, Tensor], Tensor]:
@@ -149,13 +143,13 @@ def corner_error(pose: Tensor, truth: Tensor, size: int) -> Tensor:
 def sampler_errors(noise: float, count: int, samplers: Sequence[str], tick: Callable[[], None]) -> dict[str, Tensor]:
     """Sorted errors px of x and y of the templates that the default method finds, by sampler; both frames have
     ``noise`` grey levels."""
-    both, view = pairs(count, JUMP, TURN), camera(noise_sigma=noise)
-    first, frames = view.capture(scene(), both.first, seed=SEED), view.capture(scene(), both.second, seed=SEED + 1)
-    template, start = Cut(MIDDLE, MIDDLE).template(first), MIDDLE.expand_as(both.truth)
+    (cut, second), view = pairs(count, JUMP, TURN), camera(noise_sigma=noise)
+    first, frames = view.capture(scene(), cut.pose, seed=SEED), view.capture(scene(), second, seed=SEED + 1)
+    template, start = cut.template(first), MIDDLE.expand_as(second)
     result = {}
     for name in samplers:
         pose = METHODS["linear"].start(template, start, name).track(frames)
-        error = errors(pose, both.truth)[:, :2].norm(dim=-1)
+        error = errors(pose, cut.truth(second))[:, :2].norm(dim=-1)
         result[name] = error[error < FOUND].sort().values
     tick()
     return result

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
-from typing import Any, cast
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -26,9 +27,11 @@ COMPONENTS = ("x", "y", r"$\theta$")
 UNITS = ("px", "px", "deg")
 
 
-def styled() -> AbstractContextManager[None]:
-    """The context in which a figure is drawn."""
-    return cast("AbstractContextManager[None]", mpl.rc_context(RC))
+@contextmanager
+def styled() -> Iterator[None]:
+    """The context in which a figure is drawn; a decorator too."""
+    with mpl.rc_context(RC):
+        yield
 
 
 def new_figure(width: float, height: float) -> Figure:
