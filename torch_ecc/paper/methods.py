@@ -14,7 +14,6 @@ from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.pose import retract
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.sampling import Sampler, make_sampler
-from torch_ecc.core.solver import warps
 from torch_ecc.paper.ref34 import PAPER_ITERATIONS, Ref34
 
 
@@ -41,11 +40,11 @@ class Aligned:
 
     def sampler(self, image: Tensor, interpolation: str) -> Sampler:
         """The sampler of frames (1 or R, 1, H, W), float32, around the present poses."""
-        return make_sampler(interpolation, image, warps(self.reference, self.pose), self.reference.box)
+        return make_sampler(interpolation, image, self.reference.warps(self.pose), self.reference.grid.box)
 
     def iterate(self, sample: Sampler, reference: Reference) -> None:
         """The bare iteration of Algorithm 1, lines 8 and 9: sample, step, update."""
-        g = sample(warps(reference, self.pose), reference.pixels)
+        g = sample(reference.warps(self.pose), reference.grid.pixels)
         self.pose = retract(self.pose, reference.criterion.step(reference, g).to(self.pose.dtype))
 
 

@@ -103,8 +103,10 @@ def aliased(found: Staircase) -> Tensor:
     """Covariances (K, 2, 2) nm^2 of the track by aliasing in the sampler, as the tracker knows it from its template."""
     tracker = tracker_of(found.acquired.first)
     pose = found.calibration.to_pixels(found.dwells["ECC"].mean)
-    pixels = interpolation_error(tracker.references[0], pose, tracker.settings.interpolation)
-    return 1e6 * found.calibration.covariance(pixels)[:, :2, :2]
+    shift = interpolation_error(tracker.references[0], pose, tracker.settings.interpolation)
+    if shift is None:
+        return pose.new_zeros(len(pose), 2, 2)
+    return 1e6 * found.calibration.covariance(shift @ shift.mT)[:, :2, :2]
 
 
 def sensed(pose: Tensor) -> Tensor:

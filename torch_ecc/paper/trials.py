@@ -17,7 +17,8 @@ from torch_ecc.paper.errors import errors
 from torch_ecc.paper.methods import COMPARED, METHODS, Aligned, Follower
 from torch_ecc.paper.scheme import SIZE, Cut, Kept, scene
 from torch_ecc.sim import Camera
-from torch_ecc.track.tracker import AT_ONCE, Tracker
+from torch_ecc.track.recover import AT_ONCE
+from torch_ecc.track.tracker import Tracker
 
 FRAME = (320, 320)  # (h, w) px
 MIDDLE = torch.tensor((160.0, 160.0, 0.0), dtype=torch.float64)  # where templates are in their first frame
