@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_ecc import Locator, Status, align, prepare
-from torch_ecc.core.reference import blur
+from torch_ecc.core.sampling import blur
 from torch_ecc.search.bank import details
 from torch_ecc.search.locate import LONGEST_WAY, both_ways, halvings
 
