@@ -79,7 +79,7 @@ def test_it_gives_what_a_cpu_gives(interpolation, scale, request):
 def test_one_graph_serves_all_frames(blind):
     """Operations recorded on one frame and replayed on another give that frame's poses."""
     templates, images, start = problem(2)
-    reference, settings = prepare(templates), Settings(max_iterations=8, backend="torch")
+    reference, settings = prepare(templates), Settings(max_iterations=3, backend="torch")
 
     def pose_and_status(image, pose):
         found = solve(reference, image, pose, settings)
