@@ -20,11 +20,10 @@ from scaling import SCENE, spread
 from torch import Tensor
 
 from torch_ecc import Estimate, Tracker
-from torch_ecc.core import sampling
-from torch_ecc.core.align import solve_in_torch
+from torch_ecc.core import sampling, solver, verdict
+from torch_ecc.core.align import solve
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solver import stages
 from torch_ecc.paper.result import Number
 from torch_ecc.paper.scheme import Harmonic
 from torch_ecc.sim import Camera, Sequence
@@ -85,19 +84,23 @@ def captured(solve: Solve, image: Tensor, pose: Tensor) -> Solve:
 
 
 def visited(reference: Reference, settings: Settings) -> int:
-    """Pixels that one pose takes, each as often as there are iterations on it."""
-    return sum(part.K.shape[-1] * budget for part, _, _, budget in stages(reference, settings))
+    """Pixels that one pose takes where the host never looks: every stage does all the iterations that it may."""
+    most, coarse = settings.max_iterations, reference.coarse or reference
+    first = 0 if coarse is reference and settings.interpolation == "bilinear" else max(most * 2 // 3, 1)
+    return coarse.K.shape[-1] * first * (most > 1) + reference.K.shape[-1] * most
 
 
 @contextmanager
 def never_looking() -> Iterator[None]:
     """Within, a CPU does what an accelerator does."""
-    looked_at = sampling.LOOKED_AT.copy()
-    sampling.LOOKED_AT.clear()
+    modules, looks = (sampling, solver, verdict), sampling.host_looks
     try:
+        for module in modules:
+            module.host_looks = lambda device: False
         yield
     finally:
-        sampling.LOOKED_AT.update(looked_at)
+        for module in modules:
+            module.host_looks = looks
 
 
 def follow(solve: Solve, images: list[Tensor], pose: Tensor) -> list[Tensor]:
@@ -112,13 +115,11 @@ def measure(reference: Reference, images: list[Tensor], start: Tensor, settings:
     """Poses per second, and how far at most they are from the CPU's, px or rad."""
     some = torch.arange(min(CHECKED, len(start)), device=start.device)
     near = reference.select(some).map(lambda tensor: tensor.cpu())
-    exact = follow(
-        lambda image, pose: solve_in_torch(near, image, pose, settings), [i.cpu() for i in images], start[some].cpu()
-    )
+    exact = follow(lambda image, pose: solve(near, image, pose, settings), [i.cpu() for i in images], start[some].cpu())
     with never_looking():
-        solve = captured(lambda image, pose: solve_in_torch(reference, image, pose, settings), images[0], start)
-        found = follow(solve, images, start)
-        taken = seconds(start.device, lambda: follow(solve, images, start), 3)
+        replay = captured(lambda image, pose: solve(reference, image, pose, settings), images[0], start)
+        found = follow(replay, images, start)
+        taken = seconds(start.device, lambda: follow(replay, images, start), 3)
     apart = max(float((a[some].cpu() - b).abs().max()) for a, b in zip(found, exact, strict=True))
     return len(start) * len(images) / taken, apart
 

@@ -18,7 +18,7 @@ from work import WORKS, Work
 
 import torch_ecc as te
 from torch_ecc.core.sampling import make_sampler
-from torch_ecc.core.solver import State, gauss_newton, warps
+from torch_ecc.core.solver import State, iterate
 
 SAMPLERS = ("bilinear", "bspline3", "bspline5")
 BACKENDS = options()
@@ -57,22 +57,22 @@ def test_prepare(benchmark: Benchmark, work: Work, criterion: str):
 def test_make_sampler(benchmark: Benchmark, problem, interpolation: str):
     """Prefilter of a B-spline in the neighbourhood of the patch; nothing for bilinear."""
     reference, image, pose = problem
-    benchmark(make_sampler, interpolation, image, warps(reference, pose), reference.box)
+    benchmark(make_sampler, interpolation, image, reference.warps(pose), reference.grid.box)
 
 
 @pytest.mark.parametrize("interpolation", SAMPLERS)
 def test_sample(benchmark: Benchmark, problem, interpolation: str):
     reference, image, pose = problem
-    warp = warps(reference, pose)
-    sampler = make_sampler(interpolation, image, warp, reference.box)
-    benchmark(sampler, warp, reference.pixels)
+    warp = reference.warps(pose)
+    sampler = make_sampler(interpolation, image, warp, reference.grid.box)
+    benchmark(sampler, warp, reference.grid.pixels)
 
 
 @pytest.mark.parametrize("interpolation", SAMPLERS)
 def test_one_iteration(benchmark: Benchmark, problem, interpolation: str):
+    """The prefilter and one step."""
     reference, image, pose = problem
-    sampler = make_sampler(interpolation, image, warps(reference, pose), reference.box)
-    benchmark(gauss_newton, reference, sampler, State.start(reference, pose), 1e-3)
+    benchmark(iterate, reference, image, interpolation, State.start(pose), 1e-3, 1)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -9,6 +9,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+from torch_ecc.core import sampling, solver, verdict
+
 settings.register_profile("untimed", parent=settings(), deadline=None)  # a busy machine is no failure
 settings.load_profile("untimed")
 torch.set_num_threads(1)  # small tensors: a second thread costs more than it brings
@@ -31,3 +33,10 @@ def data() -> Path:
     if not (folder / "README.md").is_file():
         pytest.skip(f"real sequences are not at {folder}; TORCH_ECC_DATA names another place")
     return folder
+
+
+@pytest.fixture
+def blind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host looks at nothing in the midst of a solve, as on an accelerator."""
+    for module in (sampling, solver, verdict):
+        monkeypatch.setattr(module, "host_looks", lambda device: False)

@@ -9,7 +9,7 @@ import torch
 
 from torch_ecc import Status, align
 from torch_ecc.core.pose import inverse, transform
-from torch_ecc.core.reference import ALIASING
+from torch_ecc.core.sampling import SAMPLERS
 from torch_ecc.core.verdict import interpolation_error
 from torch_ecc.paper.bound import cramer_rao, oracle, rounding
 from torch_ecc.paper.methods import prepared
@@ -95,7 +95,7 @@ def test_on_pads_the_error_is_what_rounding_leaves_to_anyone(turn):
     assert (apart < 0.5 * theirs).all(), apart / theirs  # the same error in each pair
 
 
-@pytest.mark.parametrize("interpolation", ALIASING)
+@pytest.mark.parametrize("interpolation", [name for name, kernel in SAMPLERS.items() if kernel.aliases])
 def test_the_covariance_knows_the_samplers_own_error(interpolation):
     """Shifts without noise or rounding: the error is the sampler's alone, and follows the sub-pixel phase."""
     phases = torch.arange(16) / 16

@@ -24,6 +24,7 @@ from torch_ecc.search.locate import (
     shortlist,
 )
 from torch_ecc.sim import Camera, GradientLight, PlaneWaves, Speckle, micrograph
+from torch_ecc.track.recover import Recovery
 
 SIZE = (200, 260)
 SCENE = PlaneWaves.random(seed=5)
@@ -434,7 +435,7 @@ def test_a_lost_template_is_searched_for_ever_more_seldom(monkeypatch):
     frames = shot(SCENE, rows((110, 95, 0)))
     tracker = Tracker(frames, [(110.0, 95.0), (60.0, 60.0)], 41)
     searched: list[int] = []
-    monkeypatch.setattr(Tracker, "_search", lambda self, images, estimate, r: searched.append(r) or estimate)
+    monkeypatch.setattr(Recovery, "search_anywhere", lambda self, images, found, last, r: searched.append(r) or found)
     total = [0]
     for _ in range(80):
         tracker(torch.full_like(frames, 90))
@@ -451,7 +452,7 @@ def test_many_lost_templates_come_in_turn(monkeypatch):
     centers = [(x, y) for x in range(30, 230, 20) for y in (40.0, 160.0)]
     tracker = Tracker(frames, centers, 25)
     searched: list[int] = []
-    monkeypatch.setattr(Tracker, "_search", lambda self, images, estimate, r: searched.append(r) or estimate)
+    monkeypatch.setattr(Recovery, "search_anywhere", lambda self, images, found, last, r: searched.append(r) or found)
     tracker(torch.full_like(frames, 90))
     assert len(searched) == 8
     for _ in range(3):

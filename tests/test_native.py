@@ -1,143 +1,43 @@
-"""The native path gives what the torch path gives, over random problems; it is compiled once and may be missing."""
+"""What is the native engine's own: compiled once, perhaps missing, and no call of its operator ends a process."""
 
 from __future__ import annotations
 
 import gc
+import json
 import subprocess
 import sys
+import weakref
 from pathlib import Path
-from typing import NamedTuple
 
+import operator_calls
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from engines import CRITERIA, FRAME, SCENE, Problem, compiled
 
 from torch_ecc import ECC, SSD, PaperECC, Status, Tracker, align, prepare
 from torch_ecc.core import native, reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.sim.scene.scene import PlaneWaves
-
-SCENE = PlaneWaves.random(seed=1)
-FRAME = (110, 130)
-CRITERIA = [ECC("gain"), ECC("linear"), ECC("quadratic"), SSD(), PaperECC()]
-
-compiled = pytest.mark.skipif(not native.load(False), reason="no C++ compiler here builds the native path")
-
-
-class Problem(NamedTuple):
-    """Templates, images and starts of an alignment, drawn at random."""
-
-    size: tuple[int, int]
-    count: int
-    shared: bool
-    masked: bool
-    anywhere: bool
-    blank: bool
-    tilted: bool
-    enough: int
-    dtype: torch.dtype
-    seed: int
-
-    def made(self, criterion):
-        generator = torch.Generator().manual_seed(self.seed)
-
-        def draw(*shape):
-            return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-        (h, w), (height, width), n = self.size, FRAME, self.count
-        shown = 1 if self.shared else n
-        still = torch.tensor([[(w - 1) / 2, (h - 1) / 2, 0.0]], dtype=torch.float64).expand(n, 3)
-        truth = torch.stack((40 + draw(n) * 50, 40 + draw(n) * 30, (draw(n) - 0.5) * 6), -1)
-        if self.anywhere:
-            truth[:, :2] = draw(n, 2) * torch.tensor([width, height])
-        if self.shared:
-            truth = truth[:1].expand(n, 3)
-        mask = (draw(n, h, w) > 0.2) * draw(n, h, w) if self.masked else None
-        if mask is not None:
-            mask[:, :3] = 1
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(reference, "ENOUGH", self.enough)
-            prepared = prepare(self.stored(SCENE.render(still, (h, w))), criterion=criterion, mask=mask)
-        image = SCENE.render(truth[:shown], FRAME) * (0 if self.blank else 1)
-        if self.tilted and not self.blank:  # so much that the plain correlation is no match
-            image = image + 3 * torch.arange(width, dtype=image.dtype)
-        noise = torch.randn(image.shape, generator=generator) * 2
-        start = truth + (draw(n, 3) - 0.5) * torch.tensor([2.0, 2.0, 0.04])
-        return prepared, self.stored(image if self.blank else image + noise), start
-
-    def stored(self, image):
-        if self.dtype.is_floating_point:
-            return image.to(self.dtype)
-        scale, most = (1, 255) if self.dtype == torch.uint8 else (100, 65535)
-        return (image * scale).round().clamp(0, most).to(self.dtype)
-
-
-problems = st.builds(
-    Problem,
-    size=st.tuples(st.integers(11, 48), st.integers(11, 48)),
-    count=st.integers(1, 3),
-    shared=st.booleans(),
-    masked=st.booleans(),
-    anywhere=st.booleans(),
-    blank=st.sampled_from([False, False, False, True]),
-    tilted=st.booleans(),
-    enough=st.sampled_from([100, 1500]),
-    dtype=st.sampled_from([torch.uint8, torch.uint16, torch.float32]),
-    seed=st.integers(0, 999),
-)
 
 
 @compiled
-@settings(deadline=None, max_examples=200)
-@given(problems, st.sampled_from(CRITERIA), st.sampled_from(["bilinear", "bspline3", "bspline5"]), st.integers(1, 15))
-def test_native_and_torch_agree(problem, criterion, interpolation, budget):
-    if isinstance(criterion, PaperECC):  # under light it does not model it comes near so slowly that paths part
-        problem = problem._replace(tilted=False)
-    prepared, image, start = problem.made(criterion)
-    fast, slow = (
-        align(prepared, image, start, interpolation=interpolation, max_iterations=budget, backend=backend)
-        for backend in ("native", "torch")
-    )
-    lost = [torch.where(each.status == Status.LOW_TEXTURE, Status.LOST, each.status) for each in (fast, slow)]
-    good = Status.good(slow.status)  # either may be the one whose predicted error is just below the tolerance
-    assert torch.equal(Status.good(fast.status), good)
-    assert torch.equal(lost[0][~good], lost[1][~good])  # what has run away may end on one side of a limit or the other
-    apart = (fast.iterations - slow.iterations).abs()
-    assert (apart <= 1)[good].all()
-    assert ((fast.pose - slow.pose).abs() < torch.where(apart > 0, 2e-3, 1e-4)[:, None]).all()
-    assert torch.equal(fast.displacement, fast.pose - start)
-    assert torch.equal(fast.covariance.isfinite(), slow.covariance.isfinite())
-    torch.testing.assert_close(fast.score[good], slow.score[good], rtol=0, atol=1e-4)
-    assert (fast.residual_rms >= 0).all()
-    # What is left after a last step that is still long is known only roughly to the native path.
-    those = (slow.status == Status.CONVERGED) & (fast.status == Status.CONVERGED) & (apart == 0)
-    torch.testing.assert_close(fast.residual_rms[those], slow.residual_rms[those], rtol=5e-3, atol=1e-3)
-    torch.testing.assert_close(fast.sigma[those], slow.sigma[those], rtol=1e-2, atol=0)
-
-
-@compiled
-def test_a_batch_is_its_elements_and_threads_do_not_matter():
-    prepared, image, start = problems_of_many().made(ECC())
-    one = [align(prepared.select(torch.tensor([k])), image[k : k + 1], start[k : k + 1]) for k in range(len(start))]
-    threads = torch.get_num_threads()
+def test_threads_do_not_matter():
+    """Each template is solved by one of them, in whatever order."""
+    prepared, image, start = Problem(count=16, place="border", enough=100).made(ECC())
+    before, found = torch.get_num_threads(), []
     try:
-        torch.set_num_threads(2)
-        many = align(prepared, image, start, backend="native")
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(align(prepared, image, start, backend="native"))
     finally:
-        torch.set_num_threads(threads)
-    for field, parts in zip(many, zip(*one, strict=True), strict=True):
-        assert torch.equal(field, torch.cat(parts))
-
-
-def problems_of_many() -> Problem:
-    return Problem((31, 40), 16, False, False, False, False, False, 100, torch.uint8, seed=3)
+        torch.set_num_threads(before)
+    for one, two in zip(*found, strict=True):
+        assert torch.equal(one, two)
 
 
 @compiled
 def test_frames_are_read_where_they_are():
     """Rows with gaps, columns with gaps and a channel of a larger tensor: the same as a copy of them."""
-    prepared, image, start = problems_of_many()._replace(count=1).made(ECC())
+    prepared, image, start = Problem(enough=100, seed=3).made(ECC())
     plain = align(prepared, image, start)
     wide = torch.nn.functional.pad(image.int(), (3, 5, 2, 4), value=99).to(torch.uint8)
     for view in (
@@ -167,10 +67,10 @@ def test_a_tracker_follows_the_same_path(options):
 @compiled
 @pytest.mark.parametrize("criterion", [ECC(), SSD(), PaperECC()])
 def test_a_mask_of_every_second_pixel(criterion):
-    """Pixels two apart are where they are: score, residual and sigma are those of the torch path."""
+    """Pixels two apart are where they are: score, residual and sigma are those of the torch page."""
     mask = torch.zeros(31, 31)
     mask[::2, ::2] = 1
-    prepared, image, start = problems_of_many()._replace(size=(31, 31), count=1).made(ECC())
+    prepared, image, start = Problem((31, 31), seed=3).made(ECC())
     template = SCENE.render(torch.tensor([[15.0, 15.0, 0.0]], dtype=torch.float64), (31, 31))
     prepared = prepare(template, criterion=criterion, mask=mask)
     fast, slow = (align(prepared, image, start, backend=backend) for backend in ("native", "torch"))
@@ -188,14 +88,14 @@ def clean():
 
 @compiled
 def test_a_mask_that_leaves_few_of_the_first_pixels():
-    """Of the sparse pixels of this mask one counts: the first iterations have nothing to go by, whatever the path."""
+    """Of the coarser grid one pixel counts: the first iterations have nothing to go by, whatever the engine."""
     template, image, start = clean()
     mask = torch.zeros(31, 31)
     mask[1::2, 1::2] = mask[0, 0] = 1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reference, "ENOUGH", 50)
         prepared = prepare(template, mask=mask)
-    assert prepared.sparse.tolist() == [0]
+    assert prepared.coarse.grid.pixels.shape[1] == 1
     fast, slow = (align(prepared, image, start, max_iterations=4, backend=backend) for backend in ("native", "torch"))
     assert torch.equal(fast.iterations, slow.iterations)
     assert (fast.pose - slow.pose).abs().max() < 1e-4
@@ -246,36 +146,105 @@ def test_what_is_left_of_a_clean_image_is_told(criterion):
 @compiled
 @pytest.mark.parametrize("size", [21, 150])
 def test_packed_templates_go_with_their_reference(size):
-    known, frame = set(native._packed), torch.rand(1, 1, 200, 200)
+    """Made once, and gone when the tracker is."""
+    frame = torch.rand(1, 1, 200, 200)
     tracker = Tracker(frame, [(100, 100)], size, backend="native")
     tracker.track(frame)
-    assert set(native._packed) - known
-    del tracker
+    packed = tracker.references[0].packed
+    tracker.track(frame)
+    assert tracker.references[0].packed is packed
+    planes = weakref.ref(packed.tensors[0])
+    del tracker, packed
     gc.collect()
-    assert not set(native._packed) - known
+    assert planes() is None
 
 
 @compiled
-@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf"), 1e300])
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_pose_that_is_nowhere_is_left_to_the_torch_path(place, wrong):
-    prepared, image, start = problems_of_many()._replace(count=1).made(ECC())
-    start[0, place] = wrong
-    estimate = native.solve(native.packed(prepared, Settings()), image, start)
-    settled = place == 2 and wrong == 1e300  # an angle like any other
-    assert settled or estimate.status == -1
+@pytest.mark.parametrize("criterion", CRITERIA, ids=str)
+@pytest.mark.parametrize("masked", [False, True])
+def test_packing_loses_nothing(criterion, masked):
+    """What 16 bits hold of a template is exactly what the page has of it."""
+    prepared, _, _ = Problem((40, 45), 2, mask="each" if masked else "none").made(criterion)
+    planes, weight, numbers = prepared.packed.tensors[:3]
+    assert planes.shape[-1] % 16 == 0
+    rows, columns = prepared.grid.pixels[1] - prepared.grid.box[1, 0], prepared.grid.pixels[0] - prepared.grid.box[0, 0]
+    at = (rows.long(), columns.long())
+    unit, level = prepared.columns.unit, prepared.columns.level
+    for image, plane, scale, shift in (
+        (prepared.columns.instrument[:, 0], 0, unit[:, :1], 0),
+        (prepared.columns.instrument[:, 3], 2, unit[:, 1:2], level[:, :1]),
+        (prepared.signal[:, 1], 4, unit[:, 2:3], 0),
+        (prepared.signal[:, 3], 5, unit[:, 3:], level[:, 1:]),
+    ):
+        torch.testing.assert_close(planes[:, plane][:, *at] * scale + shift, image, rtol=1e-6, atol=1e-5)
+    assert torch.equal(weight.expand(2, 40, -1)[:, *at], prepared.weight)
+    assert not weight[:, :, 45:].any() or weight.shape[1] == 1
+    assert len(numbers) == 2
 
 
 @compiled
-def test_templates_of_float32_poses_take_the_torch_path():
+@pytest.mark.xfail(strict=True, reason="one row of weights for all is read as if each template had its own")
+def test_templates_of_one_row():
+    """The mask leaves a single row, the same for all: each template is what it is alone."""
+    prepared, image, start = Problem(count=3).made(ECC("gain"))
+    mask = torch.zeros(31, 40)
+    mask[15] = 1
+    prepared = prepare(SCENE.render(start, (31, 40)), illumination="gain", mask=mask)
+    many = native.solve(prepared, image, start, Settings())
+    for k in range(3):
+        one = native.solve(prepared.select(torch.tensor([k])), image[k : k + 1], start[k : k + 1], Settings())
+        assert torch.equal(one.sums[0], many.sums[k])
+
+
+@compiled
+def test_templates_of_float32_poses_take_the_torch_page():
     """As they come from a device without float64."""
-    prepared, image, start = problems_of_many()._replace(count=1).made(ECC())
+    prepared, image, start = Problem(enough=100, seed=3).made(ECC())
     single = prepared.map(lambda v: v.float() if v.dtype == torch.float64 else v)
     assert (align(single, image, start).pose - align(prepared, image, start).pose).abs().max() < 1e-3
 
 
+BAD_NUMBERS = "a pose or a corner that is no number gets through to memory: std::min does not see a NaN"
+KNOWN = {  # calls that are answered wrongly today
+    **{f"pose with {name}": BAD_NUMBERS for name in ("NaN at 0", "NaN at 2", "infinity at 2", "-infinity at 2")},
+    **{
+        f"{what} {name}": BAD_NUMBERS
+        for what in ("numbers of", "corner at", "coarse corner at")
+        for name in ("NaN", "infinity", "-infinity")
+    },
+    **{f"tolerance {name}": "a tolerance is not checked" for name in ("NaN", "of infinity", "below 0")},
+    **{
+        f"{what} of {n}": "a step is not bounded: memory for it is asked for"
+        for what, n in (("coarse steps", "2^62"), ("coarse steps", "10^7"), ("steps", "2^62"), ("steps", "10^6"))
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def outcomes() -> dict[str, str]:
+    """What becomes of each direct call of the operator."""
+    run = subprocess.run([sys.executable, operator_calls.__file__], check=True, capture_output=True, text=True)
+    return json.loads(run.stdout)
+
+
+@compiled
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=KNOWN[n])) if n in KNOWN else n
+        for n in operator_calls.WRONG | operator_calls.ODD
+    ],
+)
+def test_no_direct_call_of_the_operator_ends_the_process(name, outcomes):
+    """What is wrong is refused with a sentence; what is odd may be answered."""
+    outcome = outcomes[name]
+    kind, _, words = outcome.partition(": ")
+    assert outcome == "answer" if "Error" not in kind else len(words.split()) > 3
+    assert outcome != "answer" or name not in operator_calls.WRONG
+
+
 def test_without_a_compiler_torch_serves(tmp_path):
-    """One clear line if the native path was asked for, none otherwise, and the same answer."""
+    """One clear line if the native engine was asked for, none otherwise, and the same answer."""
     code = """
 import sys, torch, torch_ecc as te
 frame = torch.rand(60, 60)
@@ -287,7 +256,7 @@ print(te.Tracker(frame, [(30, 30)], 21, backend=sys.argv[1]).track(frame).pose.r
         run = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
         assert run.stdout.strip() == "[[30.0, 30.0, 0.0]]"
         assert expected in run.stderr
-        assert ("torch path serves" in run.stderr) == (backend == "native")
+        assert ("torch page serves" in run.stderr) == (backend == "native")
 
 
 def test_unknown_backend():

@@ -14,7 +14,7 @@ from torch_ecc.core.pose import compose
 from torch_ecc.core.settings import Settings
 from torch_ecc.search.nearby import HALF_WIDTH, LARGEST_ANGLE, Nearby
 from torch_ecc.sim.scene.scene import Pads, PlaneWaves
-from torch_ecc.track.recover import AT_ONCE, NEARBY_AT_ONCE
+from torch_ecc.track.recover import AT_ONCE, NEARBY_AT_ONCE, Recovery
 
 FRAME = (240, 320)
 LIGHT = make_criterion("ecc", "linear")
@@ -38,7 +38,7 @@ def shots(scene, *steps: tuple[float, float, float]) -> torch.Tensor:
     return scene.render(poses, FRAME)[:, 0].round().clamp(0, 255).to(torch.uint8)
 
 
-def no_search(self, images, estimate, r):
+def no_search(self, images, estimate, last, r):
     raise AssertionError("the whole frame was searched")
 
 
@@ -82,7 +82,7 @@ def test_light_and_what_the_mask_leaves_out_do_not_mislead(mask):
     "jump", [(5.1, -3.3, 0.0), (-9.7, 9.1, 3.3), (0.0, 0.9 * HALF_WIDTH, -0.9 * math.degrees(LARGEST_ANGLE))]
 )
 def test_a_near_jump_needs_no_search_of_the_frame(name, jump, monkeypatch):
-    monkeypatch.setattr(Tracker, "_search", no_search)
+    monkeypatch.setattr(Recovery, "search_anywhere", no_search)
     frames = shots(SCENES[name], (0, 0, 0), jump)
     estimate = Tracker(frames[0], MIDDLE[None, :2], 101)(frames[1])
     assert estimate.status == Status.CONVERGED
@@ -93,7 +93,7 @@ def test_a_near_jump_needs_no_search_of_the_frame(name, jump, monkeypatch):
 @pytest.mark.parametrize("low", [0.0, 0.15])
 def test_fine_texture_that_moves_farther_than_the_basin_is_never_lost(low, monkeypatch):
     """4.4 px per frame in any direction, waves of 4 px and more: no prediction helps."""
-    monkeypatch.setattr(Tracker, "_search", no_search)
+    monkeypatch.setattr(Recovery, "search_anywhere", no_search)
     angle = math.tau * torch.rand(8, generator=torch.Generator().manual_seed(1))
     walk = (4.4 * torch.stack((angle.cos(), angle.sin(), 0 * angle), -1)).cumsum(0).tolist()
     frames = shots(fine(low), (0, 0, 0), *walk)
@@ -126,7 +126,7 @@ def grid(count: int) -> torch.Tensor:
 
 
 def test_a_jump_of_the_camera_is_found_for_all_at_once(monkeypatch):
-    monkeypatch.setattr(Tracker, "_search", no_search)
+    monkeypatch.setattr(Recovery, "search_anywhere", no_search)
     frames = shots(fine(), (0, 0, 0), (9, -8, 0))
     count = math.isqrt(NEARBY_AT_ONCE)
     estimate = Tracker(frames[0], grid(count), 41)(frames[1])
@@ -150,16 +150,16 @@ def test_how_many_are_searched_for_in_one_frame(monkeypatch):
     """Near: NEARBY_AT_ONCE; in the whole frame: AT_ONCE of those; the others have their turn."""
     near, whole = [], []
 
-    def look(self, image, estimate, start, due):
+    def look(self, image, estimate, start, usual, due):
         near.append(due)
         return estimate
 
-    def search(self, images, estimate, r):
+    def search(self, images, estimate, last, r):
         whole.append(r)
         return estimate
 
-    monkeypatch.setattr(Tracker, "_look_near", look)
-    monkeypatch.setattr(Tracker, "_search", search)
+    monkeypatch.setattr(Recovery, "search_near", look)
+    monkeypatch.setattr(Recovery, "search_anywhere", search)
     frame = shots(fine(), (0, 0, 0))[0]
     tracker = Tracker(frame, grid(9), 21)
     for k in range(3):

@@ -67,8 +67,7 @@ def test_the_neighbourhood_is_as_good_as_the_frame(x, y, theta, interpolation):
     image = noise(1, 1, 120, 140)
     warp, p = warp_at(x, y, theta), pixels()
     local = S.make_sampler(interpolation, image, warp, BOX)
-    degree = int(interpolation[-1])
-    whole = S.Sampler(S.prefilter(image, degree), degree)
+    whole = S.Sampler.of(image, interpolation)
     assert local.values.numel() < whole.values.numel()
     assert (local(warp, p) - whole(warp, p)).abs().max() < 1e-3
 
@@ -76,17 +75,17 @@ def test_the_neighbourhood_is_as_good_as_the_frame(x, y, theta, interpolation):
 def test_taps_agree_with_the_definition():
     """Pairs of taps as bilinear lookups give the same as the sum over all taps."""
     image = noise(1, 1, 40, 40)
-    for degree in (3, 5):
-        coefficients = S.prefilter(image, degree)
+    for interpolation, degree in (("bspline3", 3), ("bspline5", 5)):
+        coefficients = S.prefilter(image, interpolation)
         point = torch.tensor([[17.3], [21.8]])
         floor = point.floor()
-        pairs = S._pairs(point - floor, degree)
+        pairs = S.SAMPLERS[interpolation].pairs(point - floor)
         weights = torch.stack([w for _, total, second in pairs for w in (total - second, second)])
         assert torch.allclose(weights.sum(0), torch.ones(2, 1))
         taps = torch.arange(-(degree // 2), degree // 2 + 2)
         block = coefficients[0, 0][floor[1].long() + taps][:, floor[0].long() + taps]
         expected = weights[:, 1, 0] @ block @ weights[:, 0, 0]
-        sampler = S.Sampler(coefficients, degree)
+        sampler = S.Sampler.of(image, interpolation)
         value = sampler(warp_at(17.3, 21.8), torch.tensor([[0.0], [0.0], [1.0]]))
         assert value[0, 0] == pytest.approx(float(expected), abs=1e-4)
 
@@ -94,7 +93,7 @@ def test_taps_agree_with_the_definition():
 def test_gradients_are_the_slope_of_the_spline():
     image = noise(1, 1, 50, 60)
     g = S.gradients(image)
-    sampler = S.Sampler(S.prefilter(image.double().float(), 3), 3)
+    sampler = S.Sampler.of(image, "bspline3")
     step = 1e-2
     at = torch.tensor([[0.0, 5.0], [0.0, -7.0], [1.0, 1.0]])
     for axis in range(2):
@@ -132,7 +131,7 @@ def test_noise_gain(interpolation):
     p = torch.cat((torch.rand(2, 40000, generator=generator) * 340 - 170, torch.ones(1, 40000)))
     box = torch.tensor([[-170.0, 170, 170, -170], [-170.0, -170, 170, 170], [1.0, 1, 1, 1]])
     values = S.make_sampler(interpolation, image, warp_at(200, 200), box)(warp_at(200, 200), p)
-    assert float(values.var() / image.var()) == pytest.approx(S.NOISE_GAIN[interpolation], rel=0.03)
+    assert float(values.var() / image.var()) == pytest.approx(S.SAMPLERS[interpolation].noise_gain, rel=0.03)
 
 
 def test_noise_level_sees_noise_and_not_ramps_or_edges():

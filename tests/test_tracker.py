@@ -1,4 +1,4 @@
-"""Laws of the tracker: state, prediction, loss and recovery, masks, streams, devices, memory."""
+"""Laws of the tracker over every engine: state, prediction, loss, recovery, masks, streams, devices, memory."""
 
 from __future__ import annotations
 
@@ -8,16 +8,28 @@ import math
 import resource
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 import torch
+from engines import BACKENDS
 
+import torch_ecc
 from torch_ecc import SequenceError, Status, Tracker, texture
 from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=5)
 FRAME = (200, 240)
 CENTERS = [(70.0, 80.0), (150.0, 100.0), (110.4, 90.7)]
+
+once = pytest.mark.parametrize("backend", BACKENDS[:1], indirect=True)  # what has nothing to do with the engine
+
+
+@pytest.fixture(autouse=True, params=BACKENDS)
+def backend(request, monkeypatch):
+    """Every tracker made here has it."""
+    monkeypatch.setattr(sys.modules[__name__], "Tracker", partial(torch_ecc.Tracker, backend=request.param))
+    return request.param
 
 
 def poses(*rows: tuple[float, float, float]) -> torch.Tensor:
@@ -74,12 +86,14 @@ def test_first_frame_is_where_it_started():
     assert (estimate.score > 0.9999).all()
 
 
+@once
 def test_track_and_call_are_the_same():
     stack = frames(PATH)
     a, b = (Tracker(stack[0], CENTERS, 51) for _ in range(2))
     assert torch.equal(a.track(stack[1]).pose, b(stack[1]).pose)
 
 
+@once
 def test_colour_frames_and_grey_frames():
     stack = frames(PATH)
     rgb = stack[:, None].expand(-1, 3, -1, -1)
@@ -192,6 +206,7 @@ def test_texture_predicts_the_scatter():
     assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
 
 
+@once
 def test_texture_says_which_patch_is_better():
     x = torch.arange(240.0).expand(200, 240)
     flat = torch.full(FRAME, 100.0)
@@ -202,6 +217,7 @@ def test_texture_says_which_patch_is_better():
     assert bad.isinf().all()
 
 
+@once
 def test_a_sequence_error_keeps_the_track_so_far():
     stack = list(frames(PATH))
     stack[7] = stack[7][:-1]
@@ -227,17 +243,19 @@ def test_everything_moves_to_a_device(device):
     assert torch.equal(copy.deepcopy(tracker)(stack[2]).pose, tracker(stack[2]).pose)
 
 
-def test_the_accelerator_path_gives_the_same_on_a_cpu(monkeypatch):
+@pytest.mark.parametrize("backend", ["torch"], indirect=True)
+def test_the_accelerator_path_gives_the_same_on_a_cpu(request):
     """Never looking at a value, as on an accelerator, changes nothing but the cost."""
     stack = frames(PATH)
-    looking = Tracker(stack[0], CENTERS, 51, backend="torch").track_sequence(stack[1:8])
-    monkeypatch.setattr("torch_ecc.core.sampling.LOOKED_AT", set())
-    blind = Tracker(stack[0], CENTERS, 51, backend="torch").track_sequence(stack[1:8])
-    assert (looking.pose - blind.pose).abs().max() < 1e-4
-    assert torch.equal(looking.status, blind.status)
-    assert torch.equal(looking.iterations, blind.iterations)
+    looking = Tracker(stack[0], CENTERS, 51).track_sequence(stack[1:8])
+    request.getfixturevalue("blind")
+    never = Tracker(stack[0], CENTERS, 51).track_sequence(stack[1:8])
+    assert (looking.pose - never.pose).abs().max() < 1e-4
+    assert torch.equal(looking.status, never.status)
+    assert torch.equal(looking.iterations, never.iterations)
 
 
+@once
 def test_memory_stays_flat_over_a_long_stream():
     """Peak memory of a process must not grow with the number of frames (5,000 in all, short of storing poses)."""
     stack = frames(PATH)[:, 40:150, 50:170].contiguous()
@@ -288,6 +306,7 @@ def test_texture_finer_than_the_coarse_levels():
     assert torch.equal(estimate.displacement, torch.zeros(1, 3, dtype=torch.float64))
 
 
+@once
 def test_casting_a_model_leaves_the_tracker_exact():
     stack = frames(PATH)
     model = torch.nn.Sequential(Tracker(stack[0], CENTERS, 51))
@@ -297,6 +316,7 @@ def test_casting_a_model_leaves_the_tracker_exact():
         assert (model(stack[1]).status == Status.CONVERGED).all()
 
 
+@once
 def test_an_estimate_can_be_changed_without_harm():
     stack = frames(PATH)
     tracker = Tracker(stack[0], CENTERS, 51)
@@ -329,6 +349,7 @@ def test_a_wrong_place_that_looks_half_right_is_not_believed():
     assert found.pose[0, :2].tolist() == pytest.approx([170, 120], abs=0.05)
 
 
+@once
 def test_a_tracker_that_was_used_continues_in_another_process(tmp_path):
     stack = frames(PATH)
     tracker = Tracker(stack[0], CENTERS, 51)
