@@ -93,7 +93,7 @@ def test_half_way_between_pixels_and_angles_the_target_loses_less_than_the_margi
         middle = torch.tensor([30.5 + k, 45.5, float(bank.angles[k : k + 2].mean())]).double()
         image = image_pyramid(shot(scene, (middle * scale)[None], noise=3.0, seed=k).float(), level + 1)[level]
         pose, score = bank.candidates(image[0, 0], 100)
-        near = pose_distance(pose, middle, radius=reference.radius) < 4
+        near = pose_distance(pose, middle, radius=reference.place.radius) < 4
         assert score[near].max() > detrended_zncc_at(reference, image, middle[None]) - GRID_MARGIN
 
 
@@ -113,7 +113,7 @@ def test_the_bank_tells_the_zncc_and_half_way_between_angles_less_by_no_more_tha
         pose = torch.stack((torch.tensor(120 // 2**level), torch.tensor(100 // 2**level), turn))[None].double()
         image = image_pyramid(shot(scene, pose * scale).float(), level + 1)[level]
         found, score = bank.candidates(image[0, 0], 20)
-        near = pose_distance(found, pose, radius=reference.radius) < 6
+        near = pose_distance(found, pose, radius=reference.place.radius) < 6
         assert float(score[near].max()) == pytest.approx(float(detrended_zncc_at(reference, image, pose)), abs=loss)
 
 

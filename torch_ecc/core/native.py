@@ -23,7 +23,8 @@ from torch import Tensor
 
 from torch_ecc.core import packed, reference, sampling, solver
 from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
-from torch_ecc.core.reference import Moments, Normal, Reference, normal_equations
+from torch_ecc.core.normal import Moments, Normal, normal_equations
+from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import Solution
 

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.criteria import centred
+from torch_ecc.core.normal import Normal
 from torch_ecc.core.pose import retract
-from torch_ecc.core.reference import Normal, Reference, each, reweigh
+from torch_ecc.core.reference import Reference, each, reweigh
 from torch_ecc.core.sampling import Sampler, host_looks, inside, make_sampler
 from torch_ecc.core.settings import Settings
 

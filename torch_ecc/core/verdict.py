@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.estimate import Estimate, Status
-from torch_ecc.core.reference import Normal, Reference
+from torch_ecc.core.normal import Normal
+from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import SAMPLERS, host_looks
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import Solution

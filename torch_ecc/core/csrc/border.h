@@ -1,5 +1,5 @@
 // Templates of which the frame shows only a part: pixels out of sight weigh nothing, and what depends on the weights is
-// made anew (core/reference.py: reweigh, Moments).
+// made anew (core/reference.py: reweigh; core/normal.py: Moments).
 #pragma once
 #include <algorithm>
 #include <numeric>
@@ -8,7 +8,7 @@
 
 namespace ecc {
 
-struct Moments {  // reference.Moments
+struct Moments {  // normal.Moments
   double count;
   Matrix normal, power;
   double gram[4][4], noise[2][4];

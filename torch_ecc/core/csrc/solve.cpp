@@ -32,8 +32,8 @@ struct Planes {  // packed.Packed: one grid of all templates
     require(planes.dim() == 4, "planes must be (B, ", int(ecc::PLANES), ", h, pitch), got ", planes.sizes());
     const int64_t h = planes.size(2), pitch = planes.size(3);
     require(planes, "planes", at::kShort, {count, ecc::PLANES, h, pitch});
-    require(h > 0 && width > 0 && width <= pitch && pitch % ecc::LANES == 0 && step > 0,
-            "planes must have rows, width be 1 to their pitch, a multiple of ", ecc::LANES, ", and step at least 1");
+    require(h > 0 && width > 0 && width <= pitch && pitch % ecc::LANES == 0 && step > 0 && step <= 64,
+            "planes must have rows, width be 1 to their pitch, a multiple of ", ecc::LANES, ", and step 1 to 64");
     require(numbers, "numbers", at::kDouble, {count, sizeof(ecc::Numbers) / sizeof(double)});
     if (weight.dim() == 3 && weight.size(0) == 1 && weight.size(1) == 1)
       require(weight, "weight", at::kFloat, {1, 1, pitch});
@@ -75,6 +75,7 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
           "criterion must be -2, -1, 0, 2 or 5, got ", criterion);
   require(degree == 1 || degree == 3 || degree == 5, "degree must be 1, 3 or 5, got ", degree);
   require(max_iterations >= 1, "max_iterations must be at least 1, got ", max_iterations);
+  require(tolerance > 0 && std::isfinite(tolerance), "tolerance must be a length in px > 0, got ", tolerance);
   const size_t grids = grid.size() / 3;
   require(grid.size() == 3 * grids && (grids == 1 || grids == 2) && widths.size() == grids && steps.size() == grids,
           "expected planes, weight, numbers, width and step of one or two grids");

@@ -55,7 +55,8 @@ bool find(const Template& t, const Pixels& p, const Frame& frame, const Warp& wa
   bounds(p, warp, low, high);
   scratch.partial = !(low[0] >= -ECC_ROUNDING && low[1] >= -ECC_ROUNDING && high[0] <= double(frame.w - 1) + ECC_ROUNDING &&
                       high[1] <= double(frame.h - 1) + ECC_ROUNDING);
-  const bool somewhere = std::isfinite(warp.c + warp.s + warp.x0 + warp.y0);
+  const bool somewhere = std::isfinite(low[0] + high[0] + low[1] + high[1]);  // not if a corner is no number
+  scratch.partial = scratch.partial || !somewhere;
   if (scratch.partial && !(somewhere && weigh(t, p, warp, frame, scratch.border))) return false;
   Window& window = scratch.window;
   const double first = degree / 2, last = (degree + 1) / 2;
