@@ -28,6 +28,7 @@ from torch_ecc.core.pose import compose
 from torch_ecc.io import open_frames
 from torch_ecc.sim import Camera, Pads, Scene, Speckle
 from torch_ecc.sim.camera.still import image_scene
+from torch_ecc.track.recover import Recovery
 from torch_ecc.track.tracker import PREDICTIONS
 
 MIDDLE = torch.tensor([320.0, 240.0, 0.0], dtype=torch.float64)
@@ -36,11 +37,19 @@ SIDES = (121, 61)
 console = Console(width=170)
 
 
+class Nowhere(Recovery):
+    """Looks at nothing near."""
+
+    def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor, due: list[int]) -> Estimate:
+        return estimate
+
+
 class WholeFrame(Tracker):
     """Searches only in the whole frame."""
 
-    def _look_near(self, image: Tensor, estimate: Estimate, start: Tensor, due: list[int]) -> Estimate:
-        return estimate
+    def _prepare(self) -> None:
+        super()._prepare()
+        self._recovery = Nowhere(self.references[0], self.settings)
 
 
 def jump(scene: Scene, spread: tuple[float, float], seed: int, length: float, turn: float) -> Tensor:

@@ -6,10 +6,10 @@ import random
 
 import pytest
 import torch
-from engines import BACKENDS, CRITERIA, ENGINES, SAMPLERS, Problem, compiled
+from engines import BACKENDS, CRITERIA, ENGINES, FRAME, SAMPLERS, SCENE, Problem, compiled
 from torch import Tensor
 
-from torch_ecc import Estimate, Status, align
+from torch_ecc import Estimate, Status, align, prepare
 from torch_ecc.core import solver
 from torch_ecc.core.reference import Normal, Reference
 from torch_ecc.core.settings import Settings
@@ -122,3 +122,36 @@ def test_a_batch_is_its_elements(backend, place, request):
         assert (one.pose - many.pose[k]).abs().max() < 1e-5
         torch.testing.assert_close(one.residual_rms[0], many.residual_rms[k], rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(one.covariance[0], many.covariance[k], rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("interpolation", SAMPLERS)
+@pytest.mark.parametrize("enough", [100, 1500])
+def test_iterations_run_out_only_when_all_are_spent(backend, interpolation, enough):
+    """What the first stage leaves of the budget is the second one's, whatever it is."""
+    reference, image, start = Problem((41, 41), 3, enough=enough, seed=5).made(CRITERIA[1])
+    for budget in (1, 2, 3, 6, 15, 40):
+        found = align(
+            reference,
+            image,
+            start,
+            interpolation=interpolation,
+            tolerance=1e-13,
+            max_iterations=budget,
+            backend=backend,
+        )
+        spent = found.iterations == budget
+        assert ((found.status == Status.MAX_ITERATIONS) <= spent).all()
+        assert spent.all() or budget > 15
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_second_stage_has_what_the_first_one_leaves(backend):
+    """A template so noisy that steps fall short and are many, begun where the first stage has little to do."""
+    draw = torch.Generator().manual_seed(0)
+    middle, truth = torch.tensor([[[20.0, 20.0, 0.0]], [[60.3, 50.2, 0.4]]], dtype=torch.float64)
+    template = SCENE.render(middle, (41, 41)) + 25 * torch.randn(1, 1, 41, 41, generator=draw)
+    image = SCENE.render(truth, FRAME).float()
+    found = align(prepare(template), image, truth, tolerance=1e-4, max_iterations=12, backend=backend)
+    assert found.status == Status.CONVERGED
+    assert found.iterations > 12 // 3 + 2
