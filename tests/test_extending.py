@@ -70,7 +70,6 @@ def septic(f: Tensor) -> Pairs:
     return [(k - 3, w[k] + w[k + 1], w[k + 1]) for k in (0, 2, 4, 6)]
 
 
-@pytest.mark.xfail(strict=True, reason="Settings keeps a list of samplers of its own")
 def test_a_sampler(monkeypatch):
     """The smoother the spline, the less it gets wrong: every degree beats the one below."""
     taps = (2416 / 5040, 1191 / 5040, 120 / 5040, 1 / 5040)

@@ -95,17 +95,22 @@ def iterate(
     An accelerator does them all, so that the host need not know: what has converged is masked.
     """
     size, looks = (image.shape[-2], image.shape[-1]), host_looks(image.device)
-    state, g, sample, weighed = state._replace(error=torch.full_like(state.error, inf)), None, None, reference
+    state, weighed = state._replace(error=torch.full_like(state.error, inf)), reference
+    warp: Tensor | None = None
+    g: Tensor | None = None
+    sample: Sampler | None = None
     for _ in range(most):
         busy = (state.error > tolerance) & (state.iterations < most)
         if looks and not busy.any():
             break
-        warp = reference.warps(state.pose)
+        there = reference.warps(state.pose)
+        warp = there if warp is None else torch.where(busy[:, None, None], there, warp)  # else as it was last seen
         sample = make_sampler(interpolation, image, warp, reference.grid.box, sample)
         g = look(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
         whole = looks and inside(warp, reference.grid.box, size).all()
         weighed = reference if whole else reweigh(reference, inside(warp, reference.grid.pixels, size))
         increment = weighed.criterion.step(weighed, g).to(state.pose.dtype)  # eq. (9)
+        increment = torch.where(weighed.normal.total[:, None] > 0, increment, torch.nan)  # nothing in sight: no step
         state = advance(state, increment, reference.place.lever, busy)
     return state, g if g is not None else torch.zeros_like(reference.weight), weighed
 

@@ -62,6 +62,8 @@ def judge(
         textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
         low = textureless & ((status == Status.LOST) | (status == Status.OUT_OF_VIEW))
         status = torch.where(low, int(Status.LOW_TEXTURE), status).to(torch.int8)
+        unfitted = ~normal.noise_share.isfinite()  # singular: all that is in sight of the patch is left
+        rms = torch.where(unfitted, (total[:, 2] / normal.total.clamp(min=LEAST)).sqrt(), rms)
         good = Status.good(status)
         pose = torch.where(good[:, None], pose, start)
         covariance = torch.where(good[:, None, None], covariance, _unknown(pose.dtype, pose.device))

@@ -43,7 +43,7 @@ struct Planes {  // packed.Packed: one grid of all templates
 
   ecc::Pixels of(int64_t b) const {
     const int64_t h = planes.size(2), pitch = planes.size(3);
-    const bool even = weight.numel() == pitch && h > 1;
+    const bool even = weight.size(0) == 1 && weight.size(1) == 1;  // one row serves for all
     return {planes.const_data_ptr<int16_t>() + b * ecc::PLANES * h * pitch,
             reinterpret_cast<const ecc::Numbers*>(numbers.const_data_ptr<double>()) + b,
             {weight.const_data_ptr<float>() + (even ? 0 : b * h * pitch), even ? 0 : pitch}, width, h, pitch, double(step)};
