@@ -101,3 +101,21 @@ def test_from_matrix_names_a_wrong_shape():
 def test_poses_are_double_where_there_is_double():
     assert P.pose_dtype("cpu") == P.pose_dtype("cuda") == torch.float64
     assert P.pose_dtype("mps") == torch.float32
+
+
+@given(poses, poses)
+def test_one_step_further_is_the_same_motion_again(last, pose):
+    """The motion that led from one pose to the next, applied to that: W(p) W(l)^-1 W(p)."""
+    further = P.compose(P.compose(pose, P.inverse(last)), pose)
+    torch.testing.assert_close(P.ahead(pose, pose - last), further, rtol=0, atol=1e-9)
+
+
+@given(poses, st.floats(-3, 3), st.tuples(lengths, lengths))
+def test_a_constant_turn_about_any_point_is_foreseen(pose, angle, point):
+    """Wherever that point is."""
+    pivot, turn = torch.tensor([*point, 0.0]).double(), torch.tensor([0.0, 0.0, angle]).double()
+    motion = P.compose(P.compose(pivot, turn), P.inverse(pivot))
+    path = [pose]
+    for _ in range(2):
+        path.append(P.compose(motion, path[-1]))
+    torch.testing.assert_close(P.ahead(path[1], path[1] - path[0]), path[2], rtol=0, atol=1e-9)

@@ -9,6 +9,7 @@ import resource
 import subprocess
 import sys
 from functools import partial
+from itertools import pairwise
 
 import pytest
 import torch
@@ -120,6 +121,16 @@ def test_velocity_prediction_follows_where_hold_does_not():
     hold = Tracker(stack[0], center, 41, prediction="hold").track_sequence(stack[1:])
     assert (velocity.status == Status.CONVERGED).all()
     assert velocity.iterations[3:].sum() < hold.iterations[3:].sum()
+
+
+def test_a_constant_turn_is_as_little_work_as_standing_still():
+    """About a point 50 px away, 9 px and 10 deg per frame: from the third frame on the start is the answer."""
+    angle = torch.arange(8) * math.radians(10.0)
+    path = torch.stack((120 - 0 * angle, 100 - 0 * angle, angle), -1).double()
+    stack, center = frames(path), [(170.0, 100.0)]
+    turning = Tracker(stack[0], center, 61).track_sequence(stack[1:])
+    still = Tracker(stack[0], center, 61).track_sequence(stack[:1].expand(2, -1, -1))
+    assert (turning.iterations[2:] <= still.iterations[-1]).all()
 
 
 @pytest.mark.parametrize("shift", [(12.0, 5.0, 0.0), (25.0, -18.0, 0.0), (-8.0, 20.0, 0.3)])
@@ -362,3 +373,20 @@ torch.save(tracker(frame).pose, sys.argv[2])
 """
     subprocess.run([sys.executable, "-c", code, tmp_path / "saved.pt", tmp_path / "pose.pt"], check=True)
     assert (torch.load(tmp_path / "pose.pt") - tracker(stack[4]).pose).abs().max() < 1e-6
+
+
+@once
+def test_the_usual_score_is_that_of_some_twenty_frames():
+    """A single frame hardly changes what is expected; after sixty alike it is what they are."""
+    stack = frames(PATH[:1])
+    noisy = stack[0] + 30 * torch.randn(FRAME, generator=torch.Generator().manual_seed(0))
+    tracker = Tracker(stack[0], CENTERS[:1], 51, search=False)
+    first, usual = tracker.score.clone(), []
+    for _ in range(60):
+        estimate = tracker(noisy)
+        usual.append(((tracker.score - first) / (estimate.score - first)).item())
+    assert estimate.score < 0.95 * first
+    assert 0 < usual[0] < 0.1
+    assert usual[19] > 0.5
+    assert 0.9 < usual[-1] < 1
+    assert all(a < b for a, b in pairwise(usual))
