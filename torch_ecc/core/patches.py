@@ -12,7 +12,7 @@ from torch import Tensor
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.criteria import Criterion, make_criterion
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
-from torch_ecc.core.pose import pose_dtype
+from torch_ecc.core.pose import pose_dtype, turn
 from torch_ecc.core.reference import MARGIN, SMALLEST, Reference, prepare
 from torch_ecc.core.sampling import pad
 from torch_ecc.core.verdict import LARGEST_SIGMA, NOISE_SHARE, largest_variance, noise_share, pose_covariance
@@ -131,8 +131,8 @@ def texture(
     sigma = level if noise is None else torch.full_like(level, noise)
     rounding = 0.0 if require_tensor("texture", "frame", frame).is_floating_point() else QUANTISATION
     variance = sigma.to(patches.centers) ** 2 + rounding
-    pose = torch.cat((patches.centers, torch.zeros_like(patches.centers[:, :1])), 1)
-    covariance = pose_covariance(reference, reference.normal, variance, torch.ones_like(variance), pose)
+    none = torch.zeros_like(variance)
+    covariance = pose_covariance(reference, reference.normal, variance, none + 2, turn(none))
     predicted = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     observable = largest_variance(reference, covariance) <= LARGEST_SIGMA**2
     observable &= noise_share(reference, reference.normal, variance) <= NOISE_SHARE

@@ -15,6 +15,7 @@ Conventions of the whole package, written here once:
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import tau
 from typing import TYPE_CHECKING
 
@@ -76,13 +77,19 @@ def retract(pose: Tensor, increment: Tensor) -> Tensor:
     return torch.cat((t, theta), -1)
 
 
+def turn(theta: Tensor) -> Tensor:
+    """Turns an increment of a pose with its body, x and y by theta of eq. (2): (...) -> (..., 3, 3)."""
+    cosine_sine = torch.stack((theta.cos(), theta.sin()), -1).view(-1, 2)
+    still, moving = _turn(theta.dtype, theta.device)
+    return torch.addmm(still, cosine_sine, moving).view(*theta.shape, 3, 3)
+
+
 def ahead(pose: Tensor, step: Tensor) -> Tensor:
     """``pose`` = last + ``step`` after one more such step in the moving body's axes: (..., 3), (..., 3) -> (..., 3).
 
     W(pose) o W(last)^-1 o W(pose), exact for a constant turn about any point: the step turns by its own angle.
     """
-    turned = (rotation(step[..., 2]) @ step[..., :2, None])[..., 0]
-    return pose + torch.cat((turned, step[..., 2:]), -1)
+    return pose + (turn(step[..., 2]) @ step.unsqueeze(-1)).squeeze(-1)
 
 
 def unwrap(theta: Tensor, reference: Tensor) -> Tensor:
@@ -118,3 +125,12 @@ def to_se2(pose: Tensor) -> Se2:
 def from_se2(se2: Se2) -> Tensor:
     """Pose of a kornia Se2 of batch B: Se2 -> (B, 3); theta in (-pi, pi]."""
     return from_matrix(se2.matrix())
+
+
+@lru_cache(maxsize=16)
+@torch.inference_mode(False)  # what a cache keeps must serve outside inference mode too
+def _turn(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The constant part (9,) of ``turn``, and what cosine and sine are multiplied with (2, 9)."""
+    still = torch.tensor([0, 0, 0, 0, 0, 0, 0, 0, 1], dtype=dtype, device=device)
+    moving = torch.tensor([[1, 0, 0, 0, 1, 0, 0, 0, 0], [0, 1, 0, -1, 0, 0, 0, 0, 0]], dtype=dtype, device=device)
+    return still, moving

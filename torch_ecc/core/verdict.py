@@ -14,6 +14,7 @@ from torch import Tensor
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.normal import Normal
+from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import SAMPLERS, host_looks
 from torch_ecc.core.settings import Settings
@@ -48,16 +49,17 @@ def judge(
     match = score = correlation(normal, total)
     if not looks or min(score.tolist()) < settings.min_score:
         match = torch.maximum(score, detrended(normal, total))  # light alone must not make a stranger of the template
-    power, error = found.gain.square(), total[:, 6]
+    power, error, axes = found.gain.square(), total[:, 6], turn(pose[:, 2])
+    both = 1 + power
     # One image's noise v: of the residuals' mean square the template's part is gain^2 v, the frame's, sampled, NG v.
     variance = error / (power + SAMPLERS[settings.interpolation].noise_gain).mul_(normal.freedom)
-    scatter = cluster_robust(reference, normal, total[:, 10:] / (1 + power).unsqueeze(1), variance)
-    alias = interpolation_error(reference, pose, settings.interpolation)
-    covariance = pose_covariance(reference, normal, variance, power, pose, scatter, alias)
+    scatter = cluster_robust(reference, normal, total[:, 10:] / both.unsqueeze(1), variance)
+    alias = interpolation_error(reference, axes, settings.interpolation)
+    covariance = pose_covariance(reference, normal, variance, both / power, axes, scatter, alias)
     visible = torch.ones_like(score) if normal is reference.normal else normal.total / reference.normal.total
     unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
     status = decide(torch.stack((visible, match, found.gain, *unobservable, found.error, score), 1), settings)
-    rms = (error / normal.total.clamp(min=LEAST)).sqrt()
+    rms = (error / normal.total).sqrt()
     if not looks or max(status.tolist()) > Status.MAX_ITERATIONS:
         textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
         low = textureless & ((status == Status.LOST) | (status == Status.OUT_OF_VIEW))
@@ -120,9 +122,9 @@ def cluster_robust(reference: Reference, normal: Normal, clustered: Tensor, vari
     return torch.maximum(clustered.div_(normal.white).mul_(free), variance.unsqueeze(1))
 
 
-def interpolation_error(reference: Reference, pose: Tensor, interpolation: str) -> Tensor | None:
-    """What aliasing in the sampler shifts poses (B, 3) by, in the template's axes: a square root (B, 3, 2) of its
-    covariance; None where it does not count.
+def interpolation_error(reference: Reference, axes: Tensor, interpolation: str) -> Tensor | None:
+    """What aliasing in the sampler shifts poses with ``axes`` (B, 3, 3), see ``pose.turn``, by: a square root (B, 3, 2)
+    of its covariance in the template's axes; None where it does not count.
 
     Where all pixels lie alike between the frame's (no rotation) their errors add up; over a turned template they
     cancel: the mean of exp(2 pi i k step) over n neighbours k is sin(pi n step) / (n sin(pi step)) but for its phase
@@ -131,8 +133,8 @@ def interpolation_error(reference: Reference, pose: Tensor, interpolation: str) 
     alias = reference.noise.alias.get(interpolation)
     if alias is None:
         return None
-    step = torch.stack((pose[:, 2].cos(), pose[:, 2].sin()), 1)
-    step -= step.round()
+    step = axes[:, 0, :2]
+    step = step - step.round()
     coherent = torch.sinc(step * reference.grid.sides).div_(torch.sinc(step)).prod(1)
     return alias * coherent[:, None, None]
 
@@ -141,13 +143,13 @@ def pose_covariance(
     reference: Reference,
     normal: Normal,
     variance: Tensor,
-    power: Tensor,
-    pose: Tensor,
+    both: Tensor,
+    axes: Tensor,
     scatter: Tensor | None = None,
     alias: Tensor | None = None,
 ) -> Tensor:
-    """Covariance (B, 3, 3) of poses (B, 3) when template and frame have noise of ``variance`` (B,), the patch the
-    ``power`` (B,) of its gain squared.
+    """Covariance (B, 3, 3) of poses with ``axes`` (B, 3, 3), see ``pose.turn``, when template and frame have noise of
+    ``variance`` (B,): ``both`` (B,) = 1 + 1 / gain^2 times the template's.
 
     Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T, turned from the
     template's axes to the frame's. The template's noise is taken out of S, and out of P for its own part P_t: a
@@ -155,16 +157,16 @@ def pose_covariance(
     ``cluster_robust``, by default white; ``alias`` (B, 3, 2): see ``interpolation_error``.
     """
     bias = torch.minimum(variance, reference.noise.power)[:, None, None]
-    both = (1 + 1 / power.clamp(min=1e-12))[:, None, None]
-    bread = torch.linalg.inv_ex(torch.addcmul(normal.bread, bias, normal.bread_bias, value=-1))[0]
-    meat = torch.addcmul(both * normal.meat, bias, normal.meat_bias, value=-1)
-    turn = _turn(pose[:, 2])
+    bread = torch.addcmul(normal.bread, bias, normal.bread_bias, value=-1)
+    meat = torch.addcmul(both[:, None, None] * normal.meat, bias, normal.meat_bias, value=-1)
+    cofactors = torch.linalg.cross(bread.roll(-1, 1), bread.roll(-2, 1))  # the inverse is their transpose / det
+    determinant = (bread[:, :1] * cofactors[:, :1]).sum(2, keepdim=True)
     scale = (variance.unsqueeze(1) if scatter is None else scatter).sqrt().unsqueeze(2)
-    bread = torch.bmm(turn, scale * bread)
+    bread = torch.bmm(axes, cofactors.mT * (scale / determinant))
     covariance = torch.bmm(torch.bmm(bread, meat), bread.mT)
     if alias is None:
         return covariance
-    alias = torch.bmm(turn, alias)
+    alias = torch.bmm(axes, alias)
     return torch.baddbmm(covariance, alias, alias.mT)
 
 
@@ -178,12 +180,6 @@ def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = 
     most ``variance`` (B,); infinite or NaN where the texture leaves a direction open."""
     power = reference.noise.power
     return normal.noise_share * (power if variance is None else torch.minimum(power, variance))
-
-
-def _turn(theta: Tensor) -> Tensor:
-    """From the template's axes x', y', theta to the frame's: (B, 3, 3)."""
-    c, s, none = theta.cos(), theta.sin(), torch.zeros_like(theta)
-    return torch.stack((c, s, none, -s, c, none, none, none, none + 1), 1).view(-1, 3, 3)
 
 
 @lru_cache(maxsize=16)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.core.pose import rotation
+from torch_ecc.core.pose import rotation, turn
 from torch_ecc.core.verdict import interpolation_error
 from torch_ecc.paper.acquisition import tracker_of
 from torch_ecc.paper.errors import rms
@@ -103,7 +103,7 @@ def aliased(found: Staircase) -> Tensor:
     """Covariances (K, 2, 2) nm^2 of the track by aliasing in the sampler, as the tracker knows it from its template."""
     tracker = tracker_of(found.acquired.first)
     pose = found.calibration.to_pixels(found.dwells["ECC"].mean)
-    shift = interpolation_error(tracker.references[0], pose, tracker.settings.interpolation)
+    shift = interpolation_error(tracker.references[0], turn(pose[:, 2]), tracker.settings.interpolation)
     if shift is None:
         return pose.new_zeros(len(pose), 2, 2)
     return 1e6 * found.calibration.covariance(shift @ shift.mT)[:, :2, :2]

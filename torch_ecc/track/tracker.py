@@ -269,16 +269,21 @@ class Tracker(nn.Module):
     def _advance(self, estimate: Estimate, doubted: list[bool]) -> Estimate:
         """One frame on: the next state, and the ``estimate`` with the last good pose of what was not found."""
         state: Any = self._buffers
-        last, usual, pose, good = state["pose"], state["score"], estimate.pose, None
+        last, usual, pose, tracked = state["pose"], state["score"], estimate.pose, state["tracked"]
+        step = (pose - last).mul_(tracked.unsqueeze(1))
         if any(doubted):
             good = Status.good(estimate.status)
             pose = torch.where(good[:, None], pose, last)
             estimate = estimate._replace(pose=pose, displacement=pose - state["start"])
-        step = (pose - last) * state["tracked"].unsqueeze(1)
-        state["velocity"].copy_(step if good is None else step * good[:, None])
-        usual.lerp_(estimate.score if good is None else torch.where(good, estimate.score, usual), MEMORY)
-        state["tracked"].copy_(torch.ones_like(state["tracked"]) if good is None else good)
-        state["doubted"].add_(1).mul_(torch.tensor(doubted, device=last.device))
+            usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
+            step = torch.where(good[:, None], step, 0.0)
+            tracked.copy_(good)
+            state["doubted"].add_(1).mul_(torch.tensor(doubted, device=last.device))
+        else:  # the same, in fewer steps
+            usual.lerp_(estimate.score, MEMORY)
+            tracked.fill_(1)
+            state["doubted"].zero_()
+        state["velocity"].copy_(step)
         last.copy_(pose)
         return estimate
 
