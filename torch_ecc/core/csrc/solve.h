@@ -83,7 +83,7 @@ void look(const Template& t, const Pixels& p, const Warp& warp, Scratch& scratch
                      {float(warp.c * p.n->left + warp.s * y + x0), float(warp.c * y - warp.s * p.n->left + y0),
                       float(warp.c * p.step), float(-warp.s * p.step), int(p.width)},
                      band + j * p.pitch);
-      fetch(p, first + BAND + j, 3);
+      fetch(p, first + BAND + j, degree == 1 ? 3 : 6);
     }
     if (first == 0) m.base = band[p.width / 2];  // sums lose little where little is left
     add_up(t, p, scratch.weights(p), first, rows, band, m, scratch.lines.data());
