@@ -189,6 +189,25 @@ def test_noise_alone_is_no_texture():
     assert found.status == Status.LOW_TEXTURE
 
 
+@pytest.mark.parametrize(
+    ("gradient", "there", "gone"),
+    [(6.0, Status.CONVERGED, Status.LOST), (2.0, Status.LOW_TEXTURE, Status.LOW_TEXTURE)],
+    ids=["a third is noise", "five sixths are noise"],
+)
+def test_why_a_noisy_template_is_not_found(gradient, there, gone):
+    """Of the information in a template with 10 grey levels of noise and so many per px of texture. Where most of it is
+    noise, not even a good match helps, and that is why it is not found; where a third is, it must be another scene."""
+    draw, middle = torch.Generator().manual_seed(0), at(30, 30)
+    scenes = [PlaneWaves.random(seed=k, fmax=0.15, rms_gradient=4.0).render(middle, (61, 61)) for k in (1, 2)]
+
+    def shot(scene: torch.Tensor) -> torch.Tensor:
+        return 128 + gradient / 4 * (scene - 128) + 10 * torch.randn(1, 1, 61, 61, generator=draw)
+
+    reference = prepare(shot(scenes[0]))
+    found = [align(reference, shot(scene), middle, min_score=0.3).status for scene in scenes]
+    assert found == [there, gone]
+
+
 def test_iterations_run_out():
     truth = at(100.3, 90.2, 0.1)
     found = align(REFERENCE, view(truth), truth + torch.tensor([[1.5, 1.5, 0.0]]), max_iterations=2)
