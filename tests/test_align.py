@@ -276,8 +276,8 @@ def test_the_covariance_knows_of_residuals_that_cling_together(cling):
 
 @pytest.mark.parametrize(("amplitude", "status"), [(6.0, Status.CONVERGED), (0.8, Status.LOW_TEXTURE)])
 def test_a_pose_that_is_known_to_half_a_pixel_is_known(amplitude, status):
-    """A clean template with a faint wave along y', 30 grey levels of noise in the frame: sigma is noise sqrt(2) over the
-    wave's slope and the side, 0.17 px or 1.2 px."""
+    """A clean template with a faint wave along y', 30 grey levels of noise in the frame: sigma is that noise times
+    sqrt(2) over the wave's slope and the side, 0.17 px or 1.2 px."""
     y, x = torch.meshgrid(torch.arange(121.0), torch.arange(121.0), indexing="ij")
     scene = (60 * torch.cos(x) + amplitude * torch.cos(0.7 * y + 1) + 128)[None, None]
     noise = 30 * torch.randn(20, 1, 121, 121, generator=torch.Generator().manual_seed(0))
