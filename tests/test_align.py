@@ -189,6 +189,25 @@ def test_noise_alone_is_no_texture():
     assert found.status == Status.LOW_TEXTURE
 
 
+@pytest.mark.parametrize(
+    ("gradient", "there", "gone"),
+    [(6.0, Status.CONVERGED, Status.LOST), (2.0, Status.LOW_TEXTURE, Status.LOW_TEXTURE)],
+    ids=["a third is noise", "five sixths are noise"],
+)
+def test_why_a_noisy_template_is_not_found(gradient, there, gone):
+    """Of the information in a template with 10 grey levels of noise and so many per px of texture. Where most of it is
+    noise, not even a good match helps, and that is why it is not found; where a third is, it must be another scene."""
+    draw, middle = torch.Generator().manual_seed(0), at(30, 30)
+    scenes = [PlaneWaves.random(seed=k, fmax=0.15, rms_gradient=4.0).render(middle, (61, 61)) for k in (1, 2)]
+
+    def shot(scene: torch.Tensor) -> torch.Tensor:
+        return 128 + gradient / 4 * (scene - 128) + 10 * torch.randn(1, 1, 61, 61, generator=draw)
+
+    reference = prepare(shot(scenes[0]))
+    found = [align(reference, shot(scene), middle, min_score=0.3).status for scene in scenes]
+    assert found == [there, gone]
+
+
 def test_iterations_run_out():
     truth = at(100.3, 90.2, 0.1)
     found = align(REFERENCE, view(truth), truth + torch.tensor([[1.5, 1.5, 0.0]]), max_iterations=2)
@@ -222,6 +241,53 @@ def test_covariance_turns_with_the_pose(theta):
     along = transform(at(0, 0, theta), torch.tensor([[[0.0, 1.0]]], dtype=torch.float64))[0, 0]
     assert values[1] > 20 * values[0]
     assert abs(float(vectors[:, 1] @ along)) == pytest.approx(1.0, abs=0.02)
+
+
+def honesty(count: int, side: int, of_template: float, noise) -> float:
+    """Mean squared error over the covariance, 1 if that is honest, of ``count`` templates with white noise
+    ``of_template`` in frames that have what ``noise`` (count, 1, H, W) makes of white noise."""
+    draw = torch.Generator().manual_seed(side)
+    place = torch.rand(count, 3, generator=draw, dtype=torch.float64) - 0.5
+    truth = at(side / 2 + 34, side / 2 + 34) + place * torch.tensor([8.0, 8.0, 0.2])
+    white = torch.randn(count, 1, side + 70, side + 70, generator=draw)
+    templates = template(side, side) + of_template * torch.randn(count, 1, side, side, generator=draw)
+    found = align(prepare(templates), SCENE.render(truth, (side + 70, side + 70)) + noise(white), truth)
+    assert (found.status == Status.CONVERGED).all()
+    error = (found.pose - truth)[:, :, None]
+    return float((error.mT @ torch.linalg.inv(found.covariance) @ error).mean() / 3)
+
+
+@pytest.mark.parametrize("side", [13, 19, 61])
+def test_the_covariance_is_honest_for_templates_of_any_size(side):
+    """However few blocks of pixels there are to tell from whether residuals cling together."""
+    assert 0.8 < honesty(300, side, 3.0, lambda white: 3 * white) < 1.25
+
+
+@pytest.mark.parametrize("cling", ["blurred", "rows"])
+def test_the_covariance_knows_of_residuals_that_cling_together(cling):
+    """Noise alike in neighbouring pixels: as white noise it would be thought to average out, and errors exceed such a
+    sigma 2 or 3 times."""
+    noise = {
+        "blurred": lambda white: 8 * torch.nn.functional.avg_pool2d(white, 5, 1, 2) + white,
+        "rows": lambda white: white + 3 * white.roll(1, 0)[..., :1],
+    }[cling]
+    assert 0.6 < honesty(60, 61, 0.0, noise) < 2.5
+
+
+@pytest.mark.parametrize(("amplitude", "status"), [(6.0, Status.CONVERGED), (0.8, Status.LOW_TEXTURE)])
+def test_a_pose_that_is_known_to_half_a_pixel_is_known(amplitude, status):
+    """A clean template with a faint wave along y', 30 grey levels of noise in the frame: sigma is that noise times
+    sqrt(2) over the wave's slope and the side, 0.17 px or 1.2 px."""
+    y, x = torch.meshgrid(torch.arange(121.0), torch.arange(121.0), indexing="ij")
+    scene = (60 * torch.cos(x) + amplitude * torch.cos(0.7 * y + 1) + 128)[None, None]
+    noise = 30 * torch.randn(20, 1, 121, 121, generator=torch.Generator().manual_seed(0))
+    reference = prepare(scene[..., 30:91, 30:91]).select(torch.zeros(20, dtype=torch.long))
+    found = align(reference, scene + noise, at(60, 60).expand(20, 3))
+    assert (found.status == status).all()
+    if status == Status.CONVERGED:
+        expected = 30 * math.sqrt(2) / (0.7 * amplitude * 61)
+        assert float(found.sigma[:, 1].mean()) == pytest.approx(expected, rel=0.1)
+        assert float((found.pose[:, 1] - 60).square().mean().sqrt()) == pytest.approx(expected, rel=0.4)
 
 
 def test_moving_the_scene_moves_the_pose():
