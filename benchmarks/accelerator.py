@@ -93,14 +93,14 @@ def visited(reference: Reference, settings: Settings) -> int:
 @contextmanager
 def never_looking() -> Iterator[None]:
     """Within, a CPU does what an accelerator does."""
-    modules, looks = (sampling, solver, verdict), sampling.host_looks
+    modules, looks = (sampling, solver, verdict), sampling.is_cpu
     try:
         for module in modules:
-            module.host_looks = lambda device: False
+            module.is_cpu = lambda device: False
         yield
     finally:
         for module in modules:
-            module.host_looks = looks
+            module.is_cpu = looks
 
 
 def follow(solve: Solve, images: list[Tensor], pose: Tensor) -> list[Tensor]:

@@ -39,4 +39,4 @@ def data() -> Path:
 def blind(monkeypatch: pytest.MonkeyPatch) -> None:
     """The host looks at nothing in the midst of a solve, as on an accelerator."""
     for module in (sampling, solver, verdict):
-        monkeypatch.setattr(module, "host_looks", lambda device: False)
+        monkeypatch.setattr(module, "is_cpu", lambda device: False)

@@ -14,7 +14,7 @@ from torch_ecc.core import solver
 from torch_ecc.core.normal import Normal
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solver import Solution
+from torch_ecc.core.solution import Solution
 from torch_ecc.core.verdict import judge
 
 NUDGE = torch.tensor([1e-4, -7e-5, 2e-6], dtype=torch.float64)  # px, px, rad

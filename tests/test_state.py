@@ -85,7 +85,7 @@ def test_a_state_holds_what_is_lost(backend: str) -> None:
     for _ in range(3):
         assert not Status.good(tracker(BLANK).status).any()
     other.load_state_dict(through_a_file(tracker.state_dict()))
-    assert tracker.doubted.tolist() == [3, 3]
+    assert tracker.suspect_frames.tolist() == [3, 3]
     assert_goes_on_as(other, tracker, torch.cat((BLANK[None], FRAMES[3:])))
 
 

@@ -21,12 +21,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torch_ecc.core import packed, reference, sampling, solver
+from torch_ecc.core import packed, reference, sampling, solution, solver
 from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solver import Solution
+from torch_ecc.core.solution import Solution
 
 SOURCES = Path(__file__).parent / "csrc"
 DEGREE = {"bilinear": 1, "bspline3": 3, "bspline5": 5}
@@ -38,9 +38,10 @@ CONSTANTS = {  # of the Python modules, for the C++
     "ECC_BLOCK": reference.BLOCK,
     "ECC_LEVELS": reference.LEVELS,
     "ECC_ROUNDING": sampling.ROUNDING,
+    "ECC_FLAT": solution.FLAT,
     **{
         f"ECC_{name}": getattr(solver, name)
-        for name in ("COARSE_TOLERANCE", "SECANT_RANGE", "LARGEST_SCALE", "LONGEST_STEP", "FLAT")
+        for name in ("COARSE_TOLERANCE", "SECANT_RANGE", "LARGEST_SCALE", "LONGEST_STEP")
     },
 }
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.

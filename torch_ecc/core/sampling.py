@@ -138,7 +138,7 @@ class Sampler(NamedTuple):
         return bool(((low >= first) & (high < last - 2 * self.kernel.ring)).all())
 
 
-def host_looks(device: torch.device) -> bool:
+def is_cpu(device: torch.device) -> bool:
     """Whether the host may look at values in the midst of a solve: that costs a CPU nothing and stops an accelerator.
 
     It decides nothing but what is left undone: iterations after convergence, pixels of the frame far from a template.
@@ -154,7 +154,7 @@ def make_sampler(interpolation: str, image: Tensor, warp: Tensor, box: Tensor, l
     on an accelerator always all of it.
     """
     kernel, (h, w) = SAMPLERS[interpolation], image.shape[-2:]
-    if kernel.ring == 0 or not host_looks(image.device):
+    if kernel.ring == 0 or not is_cpu(image.device):
         return last or Sampler.of(image, interpolation)
     most = torch.tensor((w - 1, h - 1), dtype=warp.dtype, device=warp.device)
     corners = warp @ box.to(warp.dtype)

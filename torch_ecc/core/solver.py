@@ -13,34 +13,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.core.criteria import centred
-from torch_ecc.core.normal import Normal
 from torch_ecc.core.pose import retract
 from torch_ecc.core.reference import Reference, each, reweigh
-from torch_ecc.core.sampling import Sampler, host_looks, inside, make_sampler
+from torch_ecc.core.sampling import Sampler, inside, is_cpu, make_sampler
 from torch_ecc.core.settings import Settings
+from torch_ecc.core.solution import Solution, summed
 
 COARSE_TOLERANCE = 0.02  # px; the bilinear iterations only have to come near: their own bias is some 0.005 px
 SECANT_RANGE = 1.0  # px; steps beyond it are not accelerated
 LARGEST_SCALE = 5.0  # of an accelerated step
 LONGEST_STEP = 0.2  # of the template's radius: a longer one left the range in which the linearisation means anything
 PIXELS_AT_ONCE = 2**18  # of templates that a CPU solves together, per thread, so that they stay in its cache
-FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
-
-
-class Solution(NamedTuple):
-    """What an engine answers with, of B templates: ``pose`` (B, 3); ``error`` (B,), the predicted remaining error in px
-    at the farthest pixel; ``iterations`` (B,); of the last look the patch's ``gain`` (B,), ``sums`` (B, 10, blocks), in
-    every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 3) over the blocks with that of the squares
-    of the last three, and the ``normal`` equations of the pixels in sight. A gain or total not finite is 0."""
-
-    pose: Tensor
-    error: Tensor
-    iterations: Tensor
-    gain: Tensor
-    sums: Tensor
-    total: Tensor
-    normal: Normal
 
 
 class State(NamedTuple):
@@ -64,9 +47,7 @@ class State(NamedTuple):
 def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
     """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on. A CPU does some after the others."""
     image, many = image.float(), len(start)
-    some = (
-        max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1) if host_looks(start.device) else many
-    )
+    some = max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1) if is_cpu(start.device) else many
     if many <= some:
         return solve_at_once(reference, image, start, settings)
     parts = [slice(k, k + some) for k in range(0, many, some)]
@@ -94,11 +75,9 @@ def iterate(
 
     An accelerator does them all, so that the host need not know: what has converged is masked.
     """
-    size, looks = (image.shape[-2], image.shape[-1]), host_looks(image.device)
+    size, looks = (image.shape[-2], image.shape[-1]), is_cpu(image.device)
     state, weighed = state._replace(error=torch.full_like(state.error, inf)), reference
-    warp: Tensor | None = None
-    g: Tensor | None = None
-    sample: Sampler | None = None
+    warp, g, sample = None, torch.zeros_like(reference.weight), None
     for _ in range(most):
         busy = (state.error > tolerance) & (state.iterations < most)
         if looks and not busy.any():
@@ -106,18 +85,18 @@ def iterate(
         there = reference.warps(state.pose)
         warp = there if warp is None else torch.where(busy[:, None, None], there, warp)  # else as it was last seen
         sample = make_sampler(interpolation, image, warp, reference.grid.box, sample)
-        g = look(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
+        g = sample_patch(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
         whole = looks and inside(warp, reference.grid.box, size).all()
         weighed = reference if whole else reweigh(reference, inside(warp, reference.grid.pixels, size))
         increment = weighed.criterion.step(weighed, g).to(state.pose.dtype)  # eq. (9)
         increment = torch.where(weighed.normal.total[:, None] > 0, increment, torch.nan)  # nothing in sight: no step
         state = advance(state, increment, reference.place.lever, busy)
-    return state, g if g is not None else torch.zeros_like(reference.weight), weighed
+    return state, g, weighed
 
 
-def look(sample: Sampler, warp: Tensor, pixels: Tensor, last: Tensor | None, busy: Tensor) -> Tensor:
+def sample_patch(sample: Sampler, warp: Tensor, pixels: Tensor, last: Tensor, busy: Tensor) -> Tensor:
     """The patches (B, N) at ``warp`` (B, 2, 3); on a CPU those of templates not ``busy`` (B,) stay as they were."""
-    if last is None or not host_looks(warp.device) or busy.all():
+    if not is_cpu(warp.device) or busy.all():
         return sample(warp, pixels)
     index = busy.nonzero()[:, 0]
     return last.index_copy(0, index, sample.select(index)(warp[index], pixels))
@@ -152,23 +131,3 @@ def secant(state: State, delta: Tensor, length: Tensor) -> tuple[Tensor, Tensor]
     along = (state.delta * delta).sum(-1) / (last * last)  # = 1 - (last scale) * (share that a step covers)
     usable = (last < SECANT_RANGE) & (along < 0.9) & ~first
     return torch.where(usable, (state.scale / (1 - along)).clamp(1.0, LARGEST_SCALE), 1.0), rate
-
-
-def summed(reference: Reference, g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gain, sums and total of patches g (B, N), see ``Solution``: over the pixels of each block, of the weights w times
-
-        1, g0, g0^2, t0 g0, u g0, v g0, e^2, and of the first three rows of K times e,
-
-    with g0 and t0 the patch and the template less their weighted means, (u, v) the pixel's place in ``Place.unit``, and
-    e what the criterion's model leaves of g. Of a patch that is flat but for rounding g0 is 0.
-    """
-    w, (residual, gain) = reference.weight, reference.criterion.fit(reference, g)
-    (g0, norm), (t0, _) = centred(g, w), centred(reference.signal[:, 3], w)
-    g0 = torch.where((norm * norm > FLAT * (w * g * g).sum(-1))[:, None], g0, 0.0)
-    wg, (u, v) = w * g0, reference.uv.unbind(1)
-    each = torch.stack((w, wg, wg * g0, wg * t0, wg * u, wg * v, w * residual * residual), 1)
-    rows = torch.cat((each, reference.K[:, :3] * residual[:, None]), 1)
-    grid, dtype = reference.grid, reference.place.radius.dtype
-    sums = rows.new_zeros(len(g), rows.shape[1], grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
-    total = torch.cat((sums.sum(-1, dtype=dtype), sums[:, 7:].to(dtype).square().sum(-1)), 1)
-    return gain.to(dtype).nan_to_num_(0.0, 0.0, 0.0), sums, total.nan_to_num_(0.0, 0.0, 0.0)

@@ -16,9 +16,9 @@ from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.normal import Normal
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
-from torch_ecc.core.sampling import SAMPLERS, host_looks
+from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solver import Solution
+from torch_ecc.core.solution import Solution
 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
 NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps
@@ -45,7 +45,7 @@ def judge(
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back. ``displacement`` counts from
     ``origin`` (B, 3), by default the start."""
     normal, total, pose = found.normal, found.total, found.pose
-    looks = host_looks(pose.device)
+    looks = is_cpu(pose.device)
     match = score = correlation(normal, total)
     if not looks or min(score.tolist()) < settings.min_score:
         match = torch.maximum(score, detrended(normal, total))  # light alone must not make a stranger of the template
@@ -92,7 +92,7 @@ def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tup
 
 
 def correlation(normal: Normal, total: Tensor) -> Tensor:
-    """Zero-mean normalised correlation (B,) from the sums (B, ...) of ``solver.summed``; 0 where either is flat."""
+    """Zero-mean normalised correlation (B,) from the sums (B, ...) of ``solution.summed``; 0 where either is flat."""
     power = (total[:, 2] * normal.energy).clamp_(min=torch.finfo(total.dtype).tiny)
     return (total[:, 3] * power.rsqrt_()).clamp_(-1, 1)
 

@@ -44,20 +44,20 @@ class Recovery:
         first, then in the whole frame. ``images``: the frame, and as many coarser levels as there are already;
         ``last``: the last good pose (R, 3) and usual score (R,); ``frames`` (R,) in a row that they were suspect for.
         """
-        doubted = suspect(estimate, last[1])
-        due = self.due(doubted, frames.tolist())
+        suspects = suspect(estimate, last[1])
+        due = self.due(suspects, frames.tolist())
         if not due:
             return estimate
         images[0] = images[0].float()
         estimate = self.search_near(images[0], estimate, start, last[1], sorted(due))
-        doubted = suspect(estimate, last[1])
-        for r in [r for r in due if doubted[r]][:AT_ONCE]:
+        suspects = suspect(estimate, last[1])
+        for r in [r for r in due if suspects[r]][:AT_ONCE]:
             estimate = self.search_anywhere(images, estimate, last, r)
         return estimate
 
-    def due(self, doubted: list[bool], frames: list[int]) -> list[int]:
+    def due(self, suspects: list[bool], frames: list[int]) -> list[int]:
         """Which of the suspect templates to search for in this frame."""
-        due = [r for r, n in enumerate(frames) if doubted[r] and n % min(2 ** (n // PATIENCE), SELDOM) == 0]
+        due = [r for r, n in enumerate(frames) if suspects[r] and n % min(2 ** (n // PATIENCE), SELDOM) == 0]
         if len(due) > AT_ONCE:
             turn = int(self.turn.add_(AT_ONCE).remainder_(len(due)))
             due = due[turn:] + due[:turn]

@@ -66,7 +66,7 @@ class Tracker(nn.Module):
     velocity: Tensor
     score: Tensor
     tracked: Tensor
-    doubted: Tensor
+    suspect_frames: Tensor
     turn: Tensor
 
     @lasting
@@ -109,7 +109,7 @@ class Tracker(nn.Module):
         self.register_buffer("pose", start.clone())  # the last good one
         self.register_buffer("velocity", torch.zeros_like(start))  # what the last step has added to it
         self.register_buffer("tracked", (none + 1).to(torch.int8))  # in the last frame, 0 or 1: averages of bool fail
-        self.register_buffer("doubted", none)  # frames in a row
+        self.register_buffer("suspect_frames", none)  # frames in a row
         self.register_buffer("turn", none[0].clone())  # (): which of many lost ones is searched for next
         self._use(self._prepared(*templates))
         self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
@@ -223,13 +223,13 @@ class Tracker(nn.Module):
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image]
         estimate = self._solve(images, start)
-        doubted = suspect(estimate, state["score"])
-        if any(doubted) and self.search:
+        suspects = suspect(estimate, state["score"])
+        if any(suspects) and self.search:
             last = state["pose"], state["score"]
-            estimate = self._recovery(images, estimate, start, last, state["doubted"])
+            estimate = self._recovery(images, estimate, start, last, state["suspect_frames"])
             estimate = estimate._replace(displacement=estimate.pose - state["start"])
-            doubted = suspect(estimate, state["score"])
-        return self._advance(estimate, doubted)
+            suspects = suspect(estimate, state["score"])
+        return self._advance(estimate, suspects)
 
     def track(self, frame: Tensor) -> Estimate:
         """Same as calling the tracker."""
@@ -266,23 +266,23 @@ class Tracker(nn.Module):
             pose = torch.where(better[:, None], state.pose * scale, pose)
         return solve(self.references[0], images[0], pose, self.settings, self._buffers["start"])
 
-    def _advance(self, estimate: Estimate, doubted: list[bool]) -> Estimate:
+    def _advance(self, estimate: Estimate, suspects: list[bool]) -> Estimate:
         """One frame on: the next state, and the ``estimate`` with the last good pose of what was not found."""
         state: Any = self._buffers
         last, usual, pose, tracked = state["pose"], state["score"], estimate.pose, state["tracked"]
         step = (pose - last).mul_(tracked.unsqueeze(1))
-        if any(doubted):
+        if any(suspects):
             good = Status.good(estimate.status)
             pose = torch.where(good[:, None], pose, last)
             estimate = estimate._replace(pose=pose, displacement=pose - state["start"])
             usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
             step = torch.where(good[:, None], step, 0.0)
             tracked.copy_(good)
-            state["doubted"].add_(1).mul_(torch.tensor(doubted, device=last.device))
+            state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
         else:  # the same, in fewer steps
             usual.lerp_(estimate.score, MEMORY)
             tracked.fill_(1)
-            state["doubted"].zero_()
+            state["suspect_frames"].zero_()
         state["velocity"].copy_(step)
         last.copy_(pose)
         return estimate

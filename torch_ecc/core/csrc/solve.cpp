@@ -59,7 +59,7 @@ ecc::Frame frame_of(const Tensor& image, int64_t b) {
                                 : ecc::Frame::F32};
 }
 
-// See core/native.py. Pose, error, iterations, gain and sums of solver.Solution; and of the templates that were seen in
+// See core/native.py. Pose, error, iterations, gain and sums of solution.Solution; and of the templates that were seen in
 // part their index (n,) and moments (n, ...).
 std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorList grid,
                           at::IntArrayRef widths, at::IntArrayRef steps, int64_t criterion, int64_t degree,

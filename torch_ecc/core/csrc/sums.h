@@ -114,7 +114,7 @@ inline std::array<double, 2> rescaled(const Pixels& p, int k) {
 
 inline double finite(double value) { return std::isfinite(value) ? value : 0; }
 
-// sums (SUMS, blocks) of the last patch and its fit, as of solver.summed, and their total (SUMS + 3) over the blocks.
+// sums (SUMS, blocks) of the last patch and its fit, as of solution.summed, and their total (SUMS + 3) over the blocks.
 inline void summed(const Template& t, const Pixels& p, const Weights& weights, const Weighted& w, const float* patch,
                    Model& m, float* lines, float* sums, double* total) {
   const int64_t across = (p.width + BLOCK - 1) / BLOCK, count = across * ((p.height + BLOCK - 1) / BLOCK);

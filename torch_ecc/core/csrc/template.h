@@ -12,7 +12,7 @@
 namespace ecc {
 
 constexpr int MOST = ECC_MOST, SSD = -1, PAPER = -2;  // columns; criteria in place of a number of light columns
-constexpr int64_t BLOCK = ECC_BLOCK, SUMS = 10;       // px; rows of solver.summed
+constexpr int64_t BLOCK = ECC_BLOCK, SUMS = 10;       // px; rows of solution.summed
 using Coefficients = std::array<double, MOST>;        // of [G, t less its mean, 1, t u, t v, t u^2, t v^2, t u v]
 using Matrix = double[MOST][MOST];
 

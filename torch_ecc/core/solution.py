@@ -1,0 +1,49 @@
+"""What every engine answers with: poses, and sums of its last look over blocks of pixels, for ``verdict`` to judge."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.criteria import centred
+from torch_ecc.core.normal import Normal
+from torch_ecc.core.reference import Reference
+
+FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
+
+
+class Solution(NamedTuple):
+    """What an engine answers with, of B templates: ``pose`` (B, 3); ``error`` (B,), the predicted remaining error in px
+    at the farthest pixel; ``iterations`` (B,); of the last look the patch's ``gain`` (B,), ``sums`` (B, 10, blocks), in
+    every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 3) over the blocks with that of the squares
+    of the last three, and the ``normal`` equations of the pixels in sight. A gain or total not finite is 0."""
+
+    pose: Tensor
+    error: Tensor
+    iterations: Tensor
+    gain: Tensor
+    sums: Tensor
+    total: Tensor
+    normal: Normal
+
+
+def summed(reference: Reference, g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gain, sums and total of patches g (B, N), see ``Solution``: over the pixels of each block, of the weights w times
+
+        1, g0, g0^2, t0 g0, u g0, v g0, e^2, and of the first three rows of K times e,
+
+    with g0 and t0 the patch and the template less their weighted means, (u, v) the pixel's place in ``Place.unit``, and
+    e what the criterion's model leaves of g. Of a patch that is flat but for rounding g0 is 0.
+    """
+    w, (residual, gain) = reference.weight, reference.criterion.fit(reference, g)
+    (g0, norm), (t0, _) = centred(g, w), centred(reference.signal[:, 3], w)
+    g0 = torch.where((norm * norm > FLAT * (w * g * g).sum(-1))[:, None], g0, 0.0)
+    wg, (u, v) = w * g0, reference.uv.unbind(1)
+    each = torch.stack((w, wg, wg * g0, wg * t0, wg * u, wg * v, w * residual * residual), 1)
+    rows = torch.cat((each, reference.K[:, :3] * residual[:, None]), 1)
+    grid, dtype = reference.grid, reference.place.radius.dtype
+    sums = rows.new_zeros(len(g), rows.shape[1], grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
+    total = torch.cat((sums.sum(-1, dtype=dtype), sums[:, 7:].to(dtype).square().sum(-1)), 1)
+    return gain.to(dtype).nan_to_num_(0.0, 0.0, 0.0), sums, total.nan_to_num_(0.0, 0.0, 0.0)
