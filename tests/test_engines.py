@@ -119,7 +119,7 @@ def test_a_batch_is_its_elements(backend, place):
         if not Status.good(one.status):  # too little in sight to fix it: rounding grows from step to step
             continue
         torch.testing.assert_close(one.residual_rms[0], many.residual_rms[k], rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(one.sigma[0], many.sigma[k], rtol=1e-4, atol=0)
+        torch.testing.assert_close(one.sigma[0], many.sigma[k], rtol=2e-4, atol=0)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
