@@ -24,7 +24,7 @@ from torch import Tensor
 from torch_ecc.core import packed, reference, sampling, solution, solver
 from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
 from torch_ecc.core.normal import Moments, Normal, normal_equations
-from torch_ecc.core.reference import Reference
+from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution
 
@@ -87,7 +87,9 @@ def _visible(reference: Reference, index: Tensor, moments: Tensor) -> Normal:
     number, *matrices, gram, noise = moments.split((1, most**2, most**2, 16, 8), 1)
     normal, power = (matrix.view(-1, most, most)[:, :columns, :columns] for matrix in matrices)
     anew = normal_equations(Moments(number[:, 0], normal, power, gram.view(-1, 4, 4), noise.view(-1, 2, 4)))
-    return Normal(*(old.index_copy(0, index, new) for old, new in zip(reference.normal, anew, strict=True)))
+    if len(index) == len(reference.K):
+        return anew
+    return each(lambda old, new: old.index_copy(0, index, new), reference.normal, anew)
 
 
 @cache

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import lasting
-from torch_ecc.core.criteria import centred, safe_inverse
+from torch_ecc.core.criteria import centred
 from torch_ecc.core.sampling import blur, gradients, noise_level
 
 INSTRUMENT_BLUR = 0.9  # px; 0.7 to 1 serve alike
@@ -55,13 +55,11 @@ def errors_in_variables(sums: Tensor) -> Tensor:
     return torch.stack((n, zero, y, zero, n, -x, y, -x, square), -1).reshape(-1, 3, 3)
 
 
-def largest_eigenvalue(bread: Tensor, bias: Tensor) -> Tensor:
-    """Largest generalised eigenvalue: of bread^-1 bias, (B,), infinite where the bread is singular.
+def largest_eigenvalue(matrix: Tensor) -> Tensor:
+    """Largest eigenvalue (B,) of a product of symmetric matrices (B, n, n), positive ones; 0 if there is none.
 
     By a high power of the matrix, to 7 % from above, which an eigenvalue solver would not do without synchronising.
     """
-    inverse, regular = safe_inverse(bread)
-    share = inverse @ bias
-    scale = share.abs().amax((-2, -1), keepdim=True).clamp(min=1e-30)
-    power = torch.linalg.matrix_power(share / scale, 16).diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.where(regular & (power > 0), power.clamp(min=0) ** (1 / 16) * scale[:, 0, 0], torch.inf)
+    scale = matrix.abs().amax((-2, -1), keepdim=True).clamp(min=1e-30)
+    power = torch.linalg.matrix_power(matrix / scale, 16).diagonal(dim1=-2, dim2=-1).sum(-1)
+    return power.clamp(min=0).pow(1 / 16) * scale[:, 0, 0]

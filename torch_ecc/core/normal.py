@@ -10,6 +10,8 @@ from torch import Tensor
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.noise import errors_in_variables, largest_eigenvalue, noise_response
 
+LEAST = 1e-30  # what is divided by is at least so much
+
 
 class Moments(NamedTuple):
     """Sums over the pixels that count, of which all else that depends on the weights is made: their ``number`` (B,),
@@ -45,27 +47,29 @@ class Normal(NamedTuple):
 
 
 def normal_equations(sums: Moments) -> Normal:
-    """What follows from the sums over the pixels that count."""
+    """What follows from the sums over the pixels that count.
+
+    The first rows k of the inverse are those of K by Z W, so that k P k^T is what white noise makes of an increment;
+    their first block is the inverse of the bread, the Schur complement of the other columns.
+    """
     inverse, regular = safe_inverse(sums.normal)
-    others, _ = safe_inverse(sums.normal[:, 3:, 3:])
-    one = torch.eye(3, dtype=inverse.dtype, device=inverse.device).expand(len(inverse), 3, 3)
-    project = torch.cat((one, -sums.normal[:, :3, 3:] @ others), -1)
-    bread = (project @ sums.normal)[:, :, :3] * regular[:, None, None]
+    rows, block = inverse[:, :3], inverse[:, :3, :3]
+    spread = rows @ sums.power @ rows.mT
+    bread = torch.where(regular[:, None, None], torch.linalg.inv_ex(block)[0], 0.0)
     bread_bias, meat_bias = (
         errors_in_variables(q) * response for q, response in zip(sums.noise.unbind(1), noise_response(), strict=True)
     )
-    total, along = sums.gram[:, 0, 0], sums.gram[:, 0, 3]
-    columns = inverse.shape[-1]
+    total, along, count = sums.gram[:, 0, 0], sums.gram[:, 0, 3], sums.number.clamp(min=1)
     return Normal(
         inverse=inverse,
         bread=bread,
-        meat=project @ sums.power @ project.mT,
+        meat=bread @ spread @ bread.mT,
         bread_bias=bread_bias,
         meat_bias=meat_bias,
-        noise_share=largest_eigenvalue(bread, bread_bias),
-        white=((inverse @ sums.power) * inverse).sum(-1)[:, :3].clamp(min=1e-30),
+        noise_share=torch.where(regular, largest_eigenvalue(block @ bread_bias), torch.inf),
+        white=spread.diagonal(dim1=1, dim2=2).clamp(min=LEAST),
         total=total,
-        freedom=(total * (sums.number - columns).clamp(min=1) / sums.number.clamp(min=1)).clamp(min=1e-30),
-        energy=(sums.gram[:, 3, 3] - along * along / total.clamp(min=1e-30)).clamp(min=0),
+        freedom=(total * (count - inverse.shape[-1]).clamp(min=1) / count).clamp(min=LEAST),
+        energy=(sums.gram[:, 3, 3] - along * along / total.clamp(min=LEAST)).clamp(min=0),
         gram=sums.gram,
     )

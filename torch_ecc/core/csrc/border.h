@@ -50,8 +50,8 @@ inline void invert(Matrix& matrix, int64_t n) {
     for (int64_t j = 0; j < MOST; ++j) matrix[i][j] = regular && i < n && j < n ? wide[i][n + j] * scale[i] * scale[j] : 0;
 }
 
-// All columns of Z (plane 0) or R (1), and then u and v: (MOST + 2, height, pitch).
-inline void columns(const Pixels& p, int plane, std::vector<float>& out) {
+// The first `count` columns of Z (plane 0) or R (1), and then u and v: (MOST + 2, height, pitch).
+inline void columns(const Pixels& p, int plane, int count, std::vector<float>& out) {
   const int64_t size = p.height * p.pitch;
   const float slope = float(p.n->unit[2 * plane]), unit = float(p.n->unit[2 * plane + 1]);
   const float shift = float(p.shift(plane)), level = float(p.n->level[plane]);
@@ -65,7 +65,8 @@ inline void columns(const Pixels& p, int plane, std::vector<float>& out) {
       const Vector u = x / float(p.n->half[0]), lit = t + level, one = Vector{} + 1;
       const Vector value[] = {gx,      gy,          gx * y - gy * x, t + shift,   one, lit * u,
                               lit * v, lit * u * u, lit * (v * v),   lit * u * v, u,   one * v};
-      for (int k = 0; k < MOST + 2; ++k) store(value[k], out.data() + k * size + j * p.pitch + i);
+      for (int k = 0; k < MOST + 2; k = k + 1 == count ? MOST : k + 1)
+        store(value[k], out.data() + k * size + j * p.pitch + i);
     }
   }
 }
@@ -74,19 +75,22 @@ inline void columns(const Pixels& p, int plane, std::vector<float>& out) {
 template <class Out>
 void gram(const std::vector<float>& w, const std::vector<float>& A, const std::vector<int>& a, const std::vector<float>& B,
           const std::vector<int>& b, Out& out) {
-  constexpr int64_t CHUNK = 1024;  // of which all columns stay in the nearest cache
-  const int64_t size = int64_t(w.size());
+  constexpr int64_t CHUNK = 1024, AT_ONCE = 4;  // pixels that stay in the nearest cache; sums that do not wait for another
+  const int64_t size = int64_t(w.size()), columns = int64_t(b.size());
   std::memset(&out, 0, sizeof out);
   for (int64_t first = 0; first < size; first += CHUNK)
     for (size_t i = 0; i < a.size(); ++i) {
       float of_a[CHUNK];
-      const int64_t n = std::min(CHUNK, size - first);
+      const int64_t n = std::min(CHUNK, size - first);  // both are whole vectors
       for (int64_t k = 0; k < n; ++k) of_a[k] = w[first + k] * A[a[i] * size + first + k];
-      for (size_t j = 0; j < b.size(); ++j) {
-        const float* const of_b = B.data() + b[j] * size + first;
-        float sum = 0;
-        for (int64_t k = 0; k < n; ++k) sum += of_a[k] * of_b[k];
-        out[i][j] += double(sum);
+      for (int64_t j = 0; j < columns; j += AT_ONCE) {
+        const float* of_b[AT_ONCE];
+        Vector sum[AT_ONCE] = {};
+        for (int64_t l = 0; l < AT_ONCE; ++l) of_b[l] = B.data() + b[std::min(j + l, columns - 1)] * size + first;
+        for (int64_t k = 0; k < n; k += LANES)
+          for (int64_t l = 0; l < AT_ONCE; ++l) sum[l] += load<Vector>(of_a + k) * load<Vector>(of_b[l] + k);
+        for (int64_t l = 0; l < std::min(AT_ONCE, columns - j); ++l)
+          for (int lane = 0; lane < LANES; ++lane) out[i][j + l] += double(sum[l][lane]);
       }
     }
 }
@@ -100,6 +104,15 @@ inline void clip(double from, double step, double end, double& first, double& la
   } else if (!(low <= 0 && high >= 0)) {
     last = -1;
   }
+}
+
+// Of the weights that are in force: what grey levels count from.
+inline void means(Border& b) {
+  gram(b.weight, b.r, SHAPE, b.r, SHAPE, b.moments.gram);
+  const auto& g = b.moments.gram;
+  b.weighted.total = g[0][0];
+  b.weighted.along = g[0][3];
+  b.weighted.contrast = std::sqrt(std::max(g[3][3] - g[0][3] * g[0][3] / g[0][0], 0.0));
 }
 
 // Weights of the pixels that the warp puts inside the frame, and what follows from them for the loop. False if none is.
@@ -120,26 +133,25 @@ inline bool weigh(const Template& t, const Pixels& p, const Warp& warp, const Fr
   if (!(any > 0)) return false;
   if (b.of == &p && b.before == b.weight) return true;
   if (b.of != &p) {
-    columns(p, 0, b.z);
-    columns(p, 1, b.r);
+    columns(p, 0, t.lines(), b.z);
+    columns(p, 1, t.lines(), b.r);
   }
   b.of = &p;
   std::vector<int> all(t.lines());
   std::iota(all.begin(), all.end(), 0);
   gram(b.weight, b.z, all, b.r, all, b.moments.normal);
-  gram(b.weight, b.r, SHAPE, b.r, SHAPE, b.moments.gram);
   const auto& m = b.moments.normal;
-  const auto& g = b.moments.gram;
   Weighted& w = b.weighted;
-  w = {g[0][0], g[0][3], std::sqrt(std::max(g[3][3] - g[0][3] * g[0][3] / g[0][0], 0.0)), {m[0][3], m[1][3], m[2][3]},
-       {m[0][4], m[1][4], m[2][4]}};
+  w = {0, 0, 0, {m[0][3], m[1][3], m[2][3]}, {m[0][4], m[1][4], m[2][4]}};
+  if (t.criterion == PAPER) means(b);
   std::copy_n(&m[0][0], MOST * MOST, &w.inverse[0][0]);
   invert(w.inverse, t.columns);
   return true;
 }
 
-// The other moments of the weights that are in force.
+// And the other moments.
 inline void complete(const Template& t, const Pixels& p, Border& b) {
+  means(b);
   std::vector<float> q(b.weight), square(b.weight);
   const double u = p.n->half[0], v = p.n->half[1];
   for (int power = 0; power < 2; ++power) {  // of q, then of q^2

@@ -105,9 +105,9 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
       const bool seen = ecc::solve(t, frame_of(rows, b), settings, state, scratch);
       double* const of_all = total.data_ptr<double>() + b * (ecc::SUMS + 3);
       if (seen) {
+        if (scratch.partial) ecc::complete(t, t.whole, scratch.border);
         ecc::summed(t, t.whole, scratch.weights(t.whole), scratch.weighted(t.whole), scratch.patch.data(), scratch.model,
                     scratch.lines.data(), out, of_all);
-        if (scratch.partial) ecc::complete(t, t.whole, scratch.border);
       } else {
         scratch.border.moments = {};
         std::fill_n(out, ecc::SUMS * each, 0.f);
