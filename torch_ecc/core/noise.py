@@ -62,4 +62,5 @@ def largest_eigenvalue(matrix: Tensor) -> Tensor:
     """
     scale = matrix.abs().amax((-2, -1), keepdim=True).clamp(min=1e-30)
     power = torch.linalg.matrix_power(matrix / scale, 16).diagonal(dim1=-2, dim2=-1).sum(-1)
-    return power.clamp(min=0).pow(1 / 16) * scale[:, 0, 0]
+    largest: Tensor = power.clamp(min=0).pow(1 / 16) * scale[:, 0, 0]
+    return largest
