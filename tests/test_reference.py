@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 
 from torch_ecc import ECC, SSD, PaperECC, prepare
 from torch_ecc.core.criteria import safe_inverse
+from torch_ecc.core.noise import INSTRUMENT_BLUR, noise_response
 from torch_ecc.core.pose import transform
 from torch_ecc.core.reference import reweigh
+from torch_ecc.core.sampling import blur, gradients
 from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=3)
@@ -239,3 +241,26 @@ def test_safe_inverse_inverts_what_is_regular_and_says_what_is_not(n, seed):
     product = inverse[0] @ matrix[0]
     assert torch.allclose(product, torch.eye(n, dtype=torch.float64), atol=1e-6)
     assert (inverse[1] == 0).all()
+
+
+def test_what_noise_adds_to_the_normal_equations():
+    """Gradients that are white noise leave q (dW/dp)^T dW/dp summed over the pixels that count, times their power."""
+    generator = torch.Generator().manual_seed(0)
+    mask = torch.rand(24, 31, generator=generator) * (torch.arange(31) > 8)
+    noisy = analytic_template(24, 31) + 5 * torch.randn(1, 1, 24, 31, generator=generator)
+    reference = prepare(noisy, mask=mask, centre=torch.tensor([[2.5, -4.0]]))
+    x, y = (reference.grid.pixels[:2] - reference.place.centre[0, :, None]).double()
+    one, none = torch.ones_like(x), torch.zeros_like(x)
+    J = torch.stack((torch.stack((one, none, y)), torch.stack((none, one, -x))))  # eq. (8) at theta = 0, (2, 3, N)
+    q = (reference.weight * reference.columns.wiener)[0].double()
+    raw, blurred = noise_response()
+    sums = [torch.einsum("kin,kjn,n->ij", J, J, weight) for weight in (q, q * q)]
+    torch.testing.assert_close(reference.normal.bread_bias[0], raw * sums[0], rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(reference.normal.meat_bias[0], blurred * sums[1], rtol=1e-5, atol=1e-3)
+
+
+def test_the_response_of_gradients_to_noise_is_measured():
+    """Raw times blurred slope, and blurred slope squared, of white noise of unit variance."""
+    noise = torch.randn(1, 1, 600, 600, generator=torch.Generator().manual_seed(0))
+    raw, blurred = gradients(noise)[:, 0], gradients(blur(noise, INSTRUMENT_BLUR))[:, 0]
+    assert noise_response() == pytest.approx((float((raw * blurred).mean()), float(blurred.square().mean())), rel=0.02)

@@ -390,3 +390,40 @@ def test_the_usual_score_is_that_of_some_twenty_frames():
     assert usual[19] > 0.5
     assert 0.9 < usual[-1] < 1
     assert all(a < b for a, b in pairwise(usual))
+
+
+def test_after_a_loss_nothing_is_known_of_the_velocity():
+    """Lost for three frames and found 7 px on: there it is looked for next, not 7 px farther."""
+    stack = frames(poses((110, 95, 0), (117, 95, 0)))
+    tracker = Tracker(stack[0], [(110.0, 95.0)], 61)
+    for _ in range(3):
+        assert not Status.good(tracker(torch.full_like(stack[0], 90)).status)
+    assert tracker(stack[1]).status == Status.CONVERGED
+    still = tracker(stack[1])
+    assert still.iterations <= 3
+    assert (still.displacement[0] - torch.tensor([7.0, 0.0, 0.0])).abs().max() < 0.01
+
+
+def test_a_stranger_that_looks_a_little_like_it_is_not_taken_for_it():
+    """Its place is empty, and far away there is what resembles it by 0.65: enough for a match, not for a return."""
+    still = SCENE.render(poses((110, 95, 0)), FRAME)[0, 0] - 128
+    other = PlaneWaves.random(seed=8).render(poses((110, 95, 0)), FRAME)[0, 0] - 128
+    patch = (slice(65, 126), slice(80, 141))
+    mixed = (still / still[patch].std() + 1.17 * other / other[patch].std())[patch] * 15
+    for amount, status in ((mixed, Status.LOST), (still[patch], Status.CONVERGED)):
+        moved = torch.full(FRAME, 128.0)
+        moved[130:191, 170:231] += amount
+        assert Tracker(still + 128, [(110.0, 95.0)], 61)(moved).status == status
+
+
+@once
+@pytest.mark.parametrize("noise", [2.0, 10.0, 25.0])
+def test_what_is_expected_at_first_is_what_comes(noise):
+    """The score of a frame as noisy as the template's, known before there is one."""
+    shots = SCENE.render(PATH[:1], FRAME) + noise * torch.randn(
+        5, 1, *FRAME, generator=torch.Generator().manual_seed(0)
+    )
+    tracker = Tracker(shots[:1], CENTERS, 61)
+    expected = tracker.score.clone()
+    found = torch.stack([tracker(shot[None]).score for shot in shots[1:]]).mean(0)
+    assert (found - expected).abs().max() < 0.03

@@ -6,7 +6,7 @@ import pytest
 import torch
 from engines import BACKENDS, CRITERIA, FRAME, SCENE, Problem
 
-from torch_ecc import Status, align, prepare
+from torch_ecc import PaperECC, Status, align, prepare
 from torch_ecc.core.reference import reweigh
 from torch_ecc.core.solver import summed
 from torch_ecc.core.verdict import correlation, detrended
@@ -40,7 +40,7 @@ def test_both_correlations_are_what_they_say(criterion, seed):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_faint_texture_on_a_slope_is_found_when_light_turns_the_slope(backend):
-    """A fortieth of the template's power is texture; the slope that is all the rest comes out the other way round."""
+    """4 percent of the template are texture; the slope that is all the rest comes out the other way round."""
     middle, truth = torch.tensor([[[30.0, 30.0, 0.0]], [[60.3, 50.2, 0.0]]], dtype=torch.float64)
     u, v = (torch.arange(61.0) - 30) / 30, (torch.arange(FRAME[1]) - 60.3) / 30
     texture = [0.2 * (SCENE.render(pose, shape) - 128) for pose, shape in ((middle, (61, 61)), (truth, FRAME))]
@@ -62,3 +62,13 @@ def test_a_flat_patch_resembles_nothing(backend, level, interpolation):
         found = align(reference, image * 0 + level, start, interpolation=interpolation, backend=backend)
         assert found.score == 0
         assert found.status == Status.LOST
+
+
+@pytest.mark.parametrize("criterion", [c for c in CRITERIA if c != PaperECC()], ids=str)
+def test_what_the_columns_fit_of_the_noise_is_made_up_for(criterion):
+    """Residuals of white noise of variance 4 are smaller than it, and the fewer the pixels, the more so."""
+    reference, _, _ = Problem((11, 11), texture="rich", dtype=torch.float32).made(criterion)
+    noise = 2 * torch.randn(2000, 121, generator=torch.Generator().manual_seed(0))
+    many = reference.select(torch.zeros(2000, dtype=torch.long))
+    _, sums = summed(many, reference.signal[:, 3] + noise)
+    assert float((sums[:, 6].sum(-1) / many.normal.freedom).mean()) == pytest.approx(4, rel=0.04)
