@@ -25,6 +25,7 @@ from work import WORKS, fine, waves
 from torch_ecc import Status, Tracker, texture
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.pose import compose
+from torch_ecc.core.reference import Reference
 from torch_ecc.io import open_frames
 from torch_ecc.sim import Camera, Pads, Scene, Speckle
 from torch_ecc.sim.camera.still import image_scene
@@ -47,9 +48,9 @@ class Nowhere(Recovery):
 class WholeFrame(Tracker):
     """Searches only in the whole frame."""
 
-    def _prepare(self) -> None:
-        super()._prepare()
-        self._recovery = Nowhere(self.references[0], self.settings)
+    def _use(self, references: list[Reference]) -> None:
+        super()._use(references)
+        self._recovery = Nowhere(references[0], self.settings, self.turn)
 
 
 def jump(scene: Scene, spread: tuple[float, float], seed: int, length: float, turn: float) -> Tensor:
