@@ -79,7 +79,7 @@ def test_an_engine_gives_what_the_page_gives(engine, criterion):
         assert torch.equal(a.displacement, a.pose - start), problem
         assert torch.equal(a.covariance.isfinite(), b.covariance.isfinite()), problem
         torch.testing.assert_close(a.sigma[good], b.sigma[good], rtol=1e-3, atol=0, msg=str(problem))
-        apart = differs(a, b) & (good | exact.normal.inverse.any(-1).any(-1))  # without K: see below
+        apart = differs(a, b) & (good | exact.normal.inverse.any(-1).any(-1))  # where nothing is fitted steps are 0 / 0
         if apart.any():
             apart &= good | ~ill_posed(reference, image, start, settings, b)
         assert not apart.any(), problem
