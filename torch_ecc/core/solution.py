@@ -39,11 +39,13 @@ def summed(reference: Reference, g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     w, (residual, gain) = reference.weight, reference.criterion.fit(reference, g)
     (g0, norm), (t0, _) = centred(g, w), centred(reference.signal[:, 3], w)
-    g0 = torch.where((norm * norm > FLAT * (w * g * g).sum(-1))[:, None], g0, 0.0)
+    power, mean = norm.square(), g[:, 0] - g0[:, 0]
     wg, (u, v) = w * g0, reference.uv.unbind(1)
-    each = torch.stack((w, wg, wg * g0, wg * t0, wg * u, wg * v, w * residual * residual), 1)
-    rows = torch.cat((each, reference.K[:, :3] * residual[:, None]), 1)
+    influence = (reference.K[:, :3] * residual[:, None]).unbind(1)
+    rows = torch.stack((w, wg, wg * g0, wg * t0, wg * u, wg * v, w * residual * residual, *influence), 1)
     grid, dtype = reference.grid, reference.place.radius.dtype
     sums = rows.new_zeros(len(g), rows.shape[1], grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
+    rough = power > FLAT * (power + mean.square() * w.sum(-1))
+    sums[:, 1:6] *= rough[:, None, None]
     total = torch.cat((sums.sum(-1, dtype=dtype), sums[:, 7:].to(dtype).square().sum(-1)), 1)
     return gain.to(dtype).nan_to_num_(0.0, 0.0, 0.0), sums, total.nan_to_num_(0.0, 0.0, 0.0)
