@@ -26,13 +26,15 @@ class Moments(NamedTuple):
 
 
 class Normal(NamedTuple):
-    """The normal equations of B templates: ``inverse`` (B, p, p) of Z W R^T, zero where it is singular; for the
-    sandwich covariance, each (B, 3, 3), ``bread`` = Z W G^T and ``meat`` = Z W (Z W)^T off the other columns, and what
-    white noise of unit variance in the template adds to them (errors in variables), ``bread_bias`` and ``meat_bias``;
-    ``noise_share`` (B,): the largest part of the bread that such noise can be, in any direction; ``white`` (B, 3): the
-    square sums of the first rows of K; ``total`` (B,) of the weights, and ``freedom`` (B,), the share of it that fitted
-    columns leave; ``energy`` (B,) the weighted square sum of t off its mean; ``gram`` as in ``Moments``."""
+    """The normal equations of B templates: ``matrix`` = Z W R^T (B, p, p) and its ``inverse``, zero where it is
+    singular; for the sandwich covariance, each (B, 3, 3), ``bread`` = Z W G^T and ``meat`` = Z W (Z W)^T off the other
+    columns, and what white noise of unit variance in the template adds to them (errors in variables), ``bread_bias``
+    and ``meat_bias``; ``noise_share`` (B,): the largest part of the bread that such noise can be, in any direction;
+    ``white`` (B, 3): the square sums of the first rows of K; ``total`` (B,) of the weights, and ``freedom`` (B,), the
+    share of it that fitted columns leave; ``energy`` (B,) the weighted square sum of t off its mean; ``gram`` as in
+    ``Moments``."""
 
+    matrix: Tensor
     inverse: Tensor
     bread: Tensor
     meat: Tensor
@@ -61,6 +63,7 @@ def normal_equations(sums: Moments) -> Normal:
     )
     total, along, count = sums.gram[:, 0, 0], sums.gram[:, 0, 3], sums.number.clamp(min=1)
     return Normal(
+        matrix=sums.normal,
         inverse=inverse,
         bread=bread,
         meat=bread @ spread @ bread.mT,

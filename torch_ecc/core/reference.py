@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import lasting
-from torch_ecc.core.criteria import Criterion, make_criterion
+from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.noise import INSTRUMENT_BLUR, template_noise, wiener_weight
 from torch_ecc.core.normal import Moments, Normal, normal_equations
@@ -317,6 +317,16 @@ def reweigh(reference: Reference, visible: Tensor) -> Reference:
     columns = reference.columns._replace(weight=reference.columns.weight * visible)
     K, normal = _normal_equations(reference.criterion, reference.grid, reference.place, columns)
     return reference._replace(columns=columns, K=K, normal=normal)
+
+
+def restrict(reference: Reference, visible: Tensor) -> Reference:
+    """``reweigh`` for the loop alone, which needs no more than K and the weights: with V the pixels ``visible`` (B, N)
+    and N = Z W R^T of all, Z W V = N (K V), so that K' = (N (K V) R^T)^-1 N (K V).
+    """
+    columns, KV = reference.columns._replace(weight=reference.weight * visible), reference.K * visible[:, None]
+    R = reference.criterion.columns(reference.signal, reference.uv)
+    inverse, _ = safe_inverse(reference.normal.matrix @ (KV @ R.mT).to(reference.place.radius.dtype))
+    return reference._replace(columns=columns, K=(inverse @ reference.normal.matrix).to(KV.dtype) @ KV)
 
 
 def _normal_equations(criterion: Criterion, grid: Grid, place: Place, columns: Columns) -> tuple[Tensor, Normal]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.pose import retract
-from torch_ecc.core.reference import Reference, each, reweigh
+from torch_ecc.core.reference import Reference, each, restrict, reweigh
 from torch_ecc.core.sampling import Sampler, inside, is_cpu, make_sampler
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution, summed
@@ -63,21 +63,22 @@ def solve_at_once(reference: Reference, image: Tensor, start: Tensor, settings: 
     if most > 1 and not (settings.interpolation == "bilinear" and coarse is reference):
         near = max(settings.tolerance, COARSE_TOLERANCE)
         state, _, _ = iterate(coarse, image, "bilinear", state, near, max(most * 2 // 3, 1))
-    state, g, weighed = iterate(reference, image, settings.interpolation, state, settings.tolerance, most)
-    return Solution(state.pose, state.error, state.iterations, *summed(weighed, g), weighed.normal)
+    state, g, visible = iterate(reference, image, settings.interpolation, state, settings.tolerance, most)
+    reference = reference if visible is None else reweigh(reference, visible)
+    return Solution(state.pose, state.error, state.iterations, *summed(reference, g), reference.normal)
 
 
 def iterate(
     reference: Reference, image: Tensor, interpolation: str, state: State, tolerance: float, most: int
-) -> tuple[State, Tensor, Reference]:
+) -> tuple[State, Tensor, Tensor | None]:
     """Gauss-Newton until every predicted error is below ``tolerance`` or ``most`` iterations are spent: the state, the
-    last patches (B, N), and the reference weighed by what was in sight of them.
+    last patches (B, N), and which of their pixels were in sight (B, N), None if the host knows that all were.
 
     An accelerator does them all, so that the host need not know: what has converged is masked.
     """
     size, looks = (image.shape[-2], image.shape[-1]), is_cpu(image.device)
-    state, weighed = state._replace(error=torch.full_like(state.error, inf)), reference
-    warp, g, sample = None, torch.zeros_like(reference.weight), None
+    state = state._replace(error=torch.full_like(state.error, inf))
+    warp, g, sample, visible = None, torch.zeros_like(reference.weight), None, None
     for _ in range(most):
         busy = (state.error > tolerance) & (state.iterations < most)
         if looks and not busy.any():
@@ -87,11 +88,13 @@ def iterate(
         sample = make_sampler(interpolation, image, warp, reference.grid.box, sample)
         g = sample_patch(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
         whole = looks and inside(warp, reference.grid.box, size).all()
-        weighed = reference if whole else reweigh(reference, inside(warp, reference.grid.pixels, size))
-        increment = weighed.criterion.step(weighed, g).to(state.pose.dtype)  # eq. (9)
-        increment = torch.where(weighed.normal.total[:, None] > 0, increment, torch.nan)  # nothing in sight: no step
+        visible = None if whole else inside(warp, reference.grid.pixels, size)
+        seen = reference if visible is None else restrict(reference, visible)
+        increment = seen.criterion.step(seen, g).to(state.pose.dtype)  # eq. (9)
+        if visible is not None:
+            increment = torch.where(seen.weight.any(1, keepdim=True), increment, torch.nan)  # nothing in sight: no step
         state = advance(state, increment, reference.place.lever, busy)
-    return state, g, weighed
+    return state, g, visible
 
 
 def sample_patch(sample: Sampler, warp: Tensor, pixels: Tensor, last: Tensor, busy: Tensor) -> Tensor:
