@@ -11,12 +11,14 @@ import subprocess
 import sys
 import time
 
+import click
 import cv2
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
 
+from torch_ecc import cli
 from torch_ecc.cli import app, main
 from torch_ecc.commands.track import Session, TrackJob
 from torch_ecc.sim.scene.waves import PlaneWaves
@@ -241,3 +243,19 @@ def test_simulate_and_track_what_was_simulated(tmp_path):
     again = CliRunner().invoke(app, ["simulate", str(config), "--out", str(out)])
     assert isinstance(again.exception, ValueError)
     assert "folder must be empty or new" in str(again.exception)
+
+
+@pytest.mark.parametrize(
+    ("raised", "status"),
+    [(click.Abort(), 130), (KeyboardInterrupt(), 130), (click.UsageError("no"), 2), (OSError("no"), 2)],
+)
+def test_the_exit_status_whatever_a_command_ends_with(monkeypatch, raised, status):
+    """Ctrl-C may come at any time, not only while frames are tracked."""
+
+    def command(**_):
+        raise raised
+
+    monkeypatch.setattr(cli, "app", command)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == status

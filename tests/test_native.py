@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import os
 import subprocess
 import sys
 import weakref
@@ -239,3 +240,13 @@ print(te.Tracker(frame, [(30, 30)], 21, backend=sys.argv[1]).track(frame).pose.r
 def test_unknown_backend():
     with pytest.raises(ValueError, match=r"backend: expected one of \['auto', 'torch', 'native'\], got 'gpu'"):
         Settings(backend="gpu")
+
+
+@pytest.mark.parametrize(("compiler", "said"), [("false", "ended with status 1"), ("nosuchcompiler", "nosuchcompiler")])
+def test_a_compiler_that_fails_is_told_in_one_line(compiler, said, tmp_path):
+    code = "import torch_ecc as te, torch; te.Tracker(torch.rand(60, 60), [(30, 30)], 21).track(torch.rand(60, 60))"
+    environment = dict(os.environ, CXX=compiler, XDG_CACHE_HOME=str(tmp_path))
+    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment)
+    (line,) = [line for line in run.stderr.splitlines() if "torch page serves" in line]
+    assert said in line
+    assert len(line) < 300

@@ -427,3 +427,13 @@ def test_what_is_expected_at_first_is_what_comes(noise):
     expected = tracker.score.clone()
     found = torch.stack([tracker(shot[None]).score for shot in shots[1:]]).mean(0)
     assert (found - expected).abs().max() < 0.03
+
+
+def test_displacement_counts_from_the_start_however_a_pose_was_found(backend):
+    """Two jumps, the second from where a search has found it: pose minus start in every frame."""
+    stack = frames(poses((110, 95, 0), (128, 90, 0), (110, 95, 0), (111, 95, 0)))
+    tracker = Tracker(stack[0], [(110.0, 95.0)], 61)
+    for frame in stack[1:]:
+        estimate = tracker(frame)
+        assert estimate.status == Status.CONVERGED
+        assert torch.equal(estimate.displacement, estimate.pose - tracker.start)

@@ -219,9 +219,15 @@ def progress_bar(title: str, total: int | None = None, unit: str = "frames") -> 
 
 
 def main() -> None:
-    """Entry point: errors of the user's making in one line, exit status 2."""
+    """Entry point: errors of the user's making in a few words, exit status 2; Ctrl-C anywhere, 130."""
     try:
-        app(prog_name="torch-ecc")
+        sys.exit(app(prog_name="torch-ecc", standalone_mode=False))
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        Console(stderr=True).print("torch-ecc: stopped from the keyboard", style="red")
+        sys.exit(INTERRUPTED)
     except (ValueError, OSError) as error:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"torch-ecc: {error}", style="red", markup=False)
         sys.exit(2)

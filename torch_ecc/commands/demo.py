@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,7 +75,7 @@ def run_demo(out: Path, frames: int, advance: Callable[[int, int], None]) -> Dem
     trackers = {name: Tracker(first, center, SIZE, criterion=name) for name in PAPER}
     poses: dict[str, list[Estimate]] = {name: [] for name in PAPER}
     with ExitStack() as stack:
-        writers = {name: _open(stack, out / name) for name in PAPER}
+        writers = {name: _open(stack, out / name, trackers[name]) for name in PAPER}
         for k, frame in enumerate(sequence):
             for name, tracker in trackers.items():
                 estimate = tracker(frame)
@@ -92,9 +93,10 @@ def run_demo(out: Path, frames: int, advance: Callable[[int, int], None]) -> Dem
     return DemoResult(errors, lost)
 
 
-def _open(stack: ExitStack, folder: Path) -> tuple[TrackWriter, OverlayWriter]:
+def _open(stack: ExitStack, folder: Path, tracker: Tracker) -> tuple[TrackWriter, OverlayWriter]:
     um = Calibration(UM_PER_PX).matrix(torch.zeros(1, dtype=torch.float64))[:2, :2]
-    track = TrackWriter(folder, status_names=STATUS_NAMES, fps=25.0, um_matrix=um)
+    settings = {"criterion": str(tracker.criterion), "size": SIZE, "um_per_px": UM_PER_PX, **asdict(tracker.settings)}
+    track = TrackWriter(folder, status_names=STATUS_NAMES, fps=25.0, um_matrix=um, settings=settings)
     overlay = OverlayWriter(folder, shapes=[(SIZE, SIZE)], status_names=STATUS_NAMES, fps=25.0)
     return stack.enter_context(track), stack.enter_context(overlay)
 

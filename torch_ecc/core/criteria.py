@@ -43,7 +43,7 @@ class Prepared(Protocol):
 
     @property
     def weight(self) -> Tensor:
-        """(1 or B, N)."""
+        """(B, N)."""
 
     @property
     def uv(self) -> Tensor:
@@ -73,7 +73,7 @@ class ECC:
     g = a t + b^T G + c 1 (+ light columns) is fitted and the increment is b / a: the step of Evangelidis and Psarakis
     with the roles of template and image exchanged. ``illumination``: "gain" is the paper's ECC (one gain, one offset);
     "linear" lets the gain vary linearly over the template (columns t x', t y'), "quadratic" adds their squares and
-    product. More columns cost no time per iteration and some variance on weak templates.
+    product. More columns cost next to no time per iteration and some variance on weak templates.
     """
 
     illumination: str = "linear"

@@ -94,7 +94,7 @@ def _visible(reference: Reference, index: Tensor, moments: Tensor) -> Normal:
 
 @cache
 def operator() -> Callable[..., list[Tensor]]:
-    """The operator itself, which takes its time to be found."""
+    """The operator itself, looked up once: the lookup is slow."""
     solve: Callable[..., list[Tensor]] = torch.ops.torch_ecc.solve.default
     return solve
 
@@ -109,10 +109,17 @@ def load(wanted: bool) -> bool:
         torch.ops.load_library(str(build(compiler)))
     except (OSError, RuntimeError, subprocess.SubprocessError) as error:
         if wanted or compiler is not None:
-            reason = str(getattr(error, "stderr", None) or error).strip().splitlines()[0]
-            warnings.warn(f"torch_ecc: no native engine, the slower torch page serves ({reason})", stacklevel=2)
+            warnings.warn(f"torch_ecc: no native engine, the slower torch page serves ({_reason(error)})", stacklevel=2)
         return False
     return True
+
+
+def _reason(error: Exception) -> str:
+    """Why there is no operator, in one line: the compiler's first error if it has told one."""
+    if not isinstance(error, subprocess.CalledProcessError):
+        return str(error).strip().splitlines()[0]
+    told = [line for line in error.stderr.splitlines() if "error" in line]
+    return told[0] if told else f"the compiler {error.cmd[0]} ended with status {error.returncode}"
 
 
 def build(compiler: str) -> Path:

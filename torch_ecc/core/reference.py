@@ -320,7 +320,8 @@ def reweigh(reference: Reference, visible: Tensor) -> Reference:
 
 
 def restrict(reference: Reference, visible: Tensor) -> Reference:
-    """``reweigh`` for the loop alone, which needs no more than K and the weights: with V the pixels ``visible`` (B, N)
+    """``reweigh`` for the loop alone, which needs no more than K and the weights (``normal`` stays that of all pixels:
+    nothing to judge by): with V the pixels ``visible`` (B, N)
     and N = Z W R^T of all, Z W V = N (K V), so that K' = (N (K V) R^T)^-1 N (K V).
     """
     columns, KV = reference.columns._replace(weight=reference.weight * visible), reference.K * visible[:, None]

@@ -23,7 +23,7 @@ def described(default: T, words: str, known: Collection[str] = (), example: obje
 class Settings:
     """How to iterate and when to believe the result.
 
-    A ``backend`` of "auto" is the native path on a CPU where it is there or can be compiled, "native" says so if it
+    A ``backend`` of "auto" is the native engine on a CPU where it is there or can be compiled, "native" says so if it
     cannot, "torch" never is.
     """
 

@@ -45,7 +45,7 @@ class State(NamedTuple):
 
 
 def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
-    """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on. A CPU does some after the others."""
+    """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on; on a CPU in chunks that fit its cache."""
     image, many = image.float(), len(start)
     some = max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1) if is_cpu(start.device) else many
     if many <= some:
@@ -57,8 +57,8 @@ def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings
 
 
 def solve_at_once(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
-    """Bilinear on few pixels first, to come near; then as is asked for. What the first stage leaves of the iterations
-    is the second one's."""
+    """First bilinear on the coarser grid, to come near; then with the chosen sampler on all pixels, with the iterations
+    that are left."""
     most, coarse, state = settings.max_iterations, reference.coarse or reference, State.start(start)
     if most > 1 and not (settings.interpolation == "bilinear" and coarse is reference):
         near = max(settings.tolerance, COARSE_TOLERANCE)
@@ -126,7 +126,7 @@ def secant(state: State, delta: Tensor, length: Tensor) -> tuple[Tensor, Tensor]
     Noise in the template shortens every step by one factor 1 - q, so that steps shrink in a geometric series of ratio
     q, and two of them tell its sum, step / (1 - q) (the secant method on their common line). Only near the answer,
     where steps are such a series, and within one stage: another sampler or other pixels have another answer, to which
-    the first step is no part of it. Of that step the earlier stage tells the rate: the share it did not cover.
+    the first step is no part of it. Its rate comes from the stage before: the share that its steps left uncovered.
     """
     last, first = state.length, ~(state.error < inf)
     rate = torch.where(last > 0, length / last, 0.5)

@@ -74,7 +74,7 @@ def judge(
 
 
 def decide(amounts: Tensor, settings: Settings) -> Tensor:
-    """Status codes (B,) int8 from the ``amounts`` (B, 7) that each of ``VERDICTS`` is about, the last any number."""
+    """Status codes (B,) int8 from the ``amounts`` (B, 7) that ``VERDICTS`` are about; the last is never passed."""
     sign, limit, codes = _limits(settings, amounts.dtype, amounts.device)
     first = (amounts * sign >= limit).to(torch.int8).argmin(1)  # NaN passes nothing
     return codes[first]

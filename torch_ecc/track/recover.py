@@ -57,7 +57,7 @@ class Recovery:
 
     def due(self, suspects: list[bool], frames: list[int]) -> list[int]:
         """Which of the suspect templates to search for in this frame."""
-        due = [r for r, n in enumerate(frames) if suspects[r] and n % min(2 ** (n // PATIENCE), SELDOM) == 0]
+        due = [r for r, n in enumerate(frames) if suspects[r] and n % min(1 << min(n // PATIENCE, 8), SELDOM) == 0]
         if len(due) > AT_ONCE:
             turn = int(self.turn.add_(AT_ONCE).remainder_(len(due)))
             due = due[turn:] + due[:turn]

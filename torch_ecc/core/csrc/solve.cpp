@@ -59,9 +59,9 @@ ecc::Frame frame_of(const Tensor& image, int64_t b) {
                                 : ecc::Frame::F32};
 }
 
-// See core/native.py. Pose, error, iterations, gain and sums of solution.Solution; and of the templates that were seen in
-// part their index (n,) and moments (n, ...).
-std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorList grid,
+// See core/native.py. Pose, error, iterations, gain, sums and total of solution.Solution; and of the templates that were
+// seen in part their index (n,) and moments (n, ...).
+std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorList grids,
                           at::IntArrayRef widths, at::IntArrayRef steps, int64_t criterion, int64_t degree,
                           int64_t max_iterations, double tolerance) {
   const int64_t count = start.dim() ? start.size(0) : 0;
@@ -76,11 +76,11 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
   require(degree == 1 || degree == 3 || degree == 5, "degree must be 1, 3 or 5, got ", degree);
   require(max_iterations >= 1, "max_iterations must be at least 1, got ", max_iterations);
   require(tolerance > 0 && std::isfinite(tolerance), "tolerance must be a length in px > 0, got ", tolerance);
-  const size_t grids = grid.size() / 3;
-  require(grid.size() == 3 * grids && (grids == 1 || grids == 2) && widths.size() == grids && steps.size() == grids,
+  const size_t n = grids.size() / 3;
+  require(grids.size() == 3 * n && (n == 1 || n == 2) && widths.size() == n && steps.size() == n,
           "expected planes, weight, numbers, width and step of one or two grids");
-  const Planes all(grid.slice(0, 3), widths[0], steps[0], count);
-  const Planes coarse(grid.slice(3 * (grids - 1), 3), widths[grids - 1], steps[grids - 1], count);
+  const Planes all(grids.slice(0, 3), widths[0], steps[0], count);
+  const Planes coarse(grids.slice(3 * (n - 1), 3), widths[n - 1], steps[n - 1], count);
   require(coarse.planes.size(2) <= all.planes.size(2) && coarse.planes.size(3) <= all.planes.size(3),
           "the second grid must not be larger than the first");
   const Tensor rows = image.stride(3) == 1 ? image : image.contiguous(), from = start.contiguous();
@@ -98,7 +98,7 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
   at::parallel_for(0, std::min<int64_t>(count, at::get_num_threads()), 1, [&](int64_t, int64_t) {
     thread_local ecc::Scratch scratch;
     for (int64_t b = next++; b < count; b = next++) {
-      const ecc::Template t{criterion, criterion < 0 ? 3 : 5 + criterion, grids == 2, all.of(b), coarse.of(b)};
+      const ecc::Template t{criterion, criterion < 0 ? 3 : 5 + criterion, n == 2, all.of(b), coarse.of(b)};
       const double* at = from.const_data_ptr<double>() + 3 * b;
       ecc::State state{{at[0], at[1], at[2]}};
       float* const out = sums.data_ptr<float>() + b * ecc::SUMS * each;
