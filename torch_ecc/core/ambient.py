@@ -17,7 +17,16 @@ import torch
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-AUTOCAST = ("cpu", "cuda", "mps", "xpu")  # kinds of devices that a tracker may be on and that have an autocast
+
+def _has_autocast(kind: str) -> bool:
+    try:
+        torch.is_autocast_enabled(kind)
+    except RuntimeError:  # torch 2.4 knows none for mps
+        return False
+    return True
+
+
+AUTOCAST = tuple(filter(_has_autocast, ("cpu", "cuda", "mps", "xpu")))  # devices that have one
 
 _anywhere: Callable[[], bool] = torch._C._is_any_autocast_enabled  # one question for all: it is asked in every frame
 
