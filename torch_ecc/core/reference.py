@@ -234,11 +234,11 @@ def _prepared(criterion: Criterion, gray: Tensor, kept: Tensor, centre: Tensor, 
     wiener = counted(wiener_weight(slopes, noise))
     weight = kept.flatten(1)[:, used]
     place = _place(grid, centre, weight)
-    columns = _columns(
-        grid.pixels[:2] - centre[:, :, None],
+    images = (
         torch.cat((counted(slopes) * wiener, counted(soft)), 1),
         torch.cat((counted(gradients(wide)), counted(wide)), 1),
-    )._replace(wiener=wiener[:, 0], weight=weight)
+    )
+    columns = _columns(grid.pixels[:2] - centre[:, :, None], images, wiener[:, 0], weight)
     reference = _solved(criterion, grid, place, columns, Noise(noise, noise.to(place.radius.dtype).square(), {}))
     for name, kernel in SAMPLERS.items():
         if kernel.aliases:
@@ -270,20 +270,20 @@ def _place(grid: Grid, centre: Tensor, weight: Tensor) -> Place:
     return Place(centre, radius, lever, lever.square(), torch.cat((one, -centre[:, :, None]), -1) / half)
 
 
-def _columns(local: Tensor, soft: Tensor, sharp: Tensor) -> Columns:
-    """Rounded columns from [d/dx, d/dy, t] (B, 3, N), blurred and raw, at ``local`` (B, 2, N) about the centre."""
-    images, units, levels = [], [], []
-    for image in (soft, sharp):
+def _columns(local: Tensor, images: tuple[Tensor, Tensor], wiener: Tensor, weight: Tensor) -> Columns:
+    """Rounded columns from ``images`` [d/dx, d/dy, t] (B, 3, N), blurred and raw, at ``local`` (B, 2, N) about the
+    centre."""
+    columns, units, levels = [], [], []
+    for image in images:
         level = image[:, 2:].mean(-1, keepdim=True)
         parts = image[:, :2], image[:, 2:] - level
         unit = [part.abs().amax((1, 2), keepdim=True).clamp(min=1e-30) / LEVELS for part in parts]
         slopes, t = (unit * (part / unit).round() for part, unit in zip(parts, unit, strict=True))
-        images.append(_steepest_descent(torch.cat((slopes, t + level), 1), local))
+        columns.append(_steepest_descent(torch.cat((slopes, t + level), 1), local))
         units += unit
         levels.append(level)
-    signal, instrument = images[1], images[0]
-    nothing = signal[:, 0]
-    return Columns(signal, instrument, nothing, nothing, torch.cat(units, 1)[..., 0], torch.cat(levels, 1)[..., 0])
+    instrument, signal = columns
+    return Columns(signal, instrument, wiener, weight, torch.cat(units, 1)[..., 0], torch.cat(levels, 1)[..., 0])
 
 
 def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:

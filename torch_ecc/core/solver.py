@@ -76,18 +76,18 @@ def iterate(
 
     An accelerator does them all, so that the host need not know: what has converged is masked.
     """
-    size, looks = (image.shape[-2], image.shape[-1]), is_cpu(image.device)
+    size, on_cpu = (image.shape[-2], image.shape[-1]), is_cpu(image.device)
     state = state._replace(error=torch.full_like(state.error, inf))
     warp, g, sample, visible = None, torch.zeros_like(reference.weight), None, None
     for _ in range(most):
         busy = (state.error > tolerance) & (state.iterations < most)
-        if looks and not busy.any():
+        if on_cpu and not busy.any():
             break
         there = reference.warps(state.pose)
         warp = there if warp is None else torch.where(busy[:, None, None], there, warp)  # else as it was last seen
         sample = make_sampler(interpolation, image, warp, reference.grid.box, sample)
         g = sample_patch(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
-        whole = looks and inside(warp, reference.grid.box, size).all()
+        whole = on_cpu and inside(warp, reference.grid.box, size).all()
         visible = None if whole else inside(warp, reference.grid.pixels, size)
         seen = reference if visible is None else restrict(reference, visible)
         increment = seen.criterion.step(seen, g).to(state.pose.dtype)  # eq. (9)

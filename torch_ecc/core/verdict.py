@@ -45,22 +45,22 @@ def judge(
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back. ``displacement`` counts from
     ``origin`` (B, 3), by default the start."""
     normal, total, pose = found.normal, found.total, found.pose
-    looks = is_cpu(pose.device)
+    on_cpu = is_cpu(pose.device)
     match = score = correlation(normal, total)
-    if not looks or min(score.tolist()) < settings.min_score:
+    if not on_cpu or min(score.tolist()) < settings.min_score:
         match = torch.maximum(score, detrended(normal, total))  # light alone must not make a stranger of the template
     power, error, axes = found.gain.square(), total[:, 6], turn(pose[:, 2])
-    both = 1 + power
+    of_both = 1 + power  # variance of template and frame together
     # One image's noise v: of the residuals' mean square the template's part is gain^2 v, the frame's, sampled, NG v.
     variance = error / (power + SAMPLERS[settings.interpolation].noise_gain).mul_(normal.freedom)
-    scatter = cluster_robust(reference, normal, total[:, 10:] / both.unsqueeze(1), variance)
+    scatter = cluster_robust(reference, normal, total[:, 10:] / of_both.unsqueeze(1), variance)
     alias = interpolation_error(reference, axes, settings.interpolation)
-    covariance = pose_covariance(reference, normal, variance, both / power, axes, scatter, alias)
+    covariance = pose_covariance(reference, normal, variance, of_both / power, axes, scatter, alias)
     visible = torch.ones_like(score) if normal is reference.normal else normal.total / reference.normal.total
     unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
     status = decide(torch.stack((visible, match, found.gain, *unobservable, found.error, score), 1), settings)
     rms = (error / normal.total).sqrt()
-    if not looks or max(status.tolist()) > Status.MAX_ITERATIONS:
+    if not on_cpu or max(status.tolist()) > Status.MAX_ITERATIONS:
         textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
         low = textureless & ((status == Status.LOST) | (status == Status.OUT_OF_VIEW))
         status = torch.where(low, int(Status.LOW_TEXTURE), status).to(torch.int8)
@@ -143,13 +143,13 @@ def pose_covariance(
     reference: Reference,
     normal: Normal,
     variance: Tensor,
-    both: Tensor,
+    factor: Tensor,
     axes: Tensor,
     scatter: Tensor | None = None,
     alias: Tensor | None = None,
 ) -> Tensor:
     """Covariance (B, 3, 3) of poses with ``axes`` (B, 3, 3), see ``pose.turn``, when template and frame have noise of
-    ``variance`` (B,): ``both`` (B,) = 1 + 1 / gain^2 times the template's.
+    ``variance`` (B,): ``factor`` (B,) = 1 + 1 / gain^2 times the template's.
 
     Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T, turned from the
     template's axes to the frame's. The template's noise is taken out of S, and out of P for its own part P_t: a
@@ -158,7 +158,7 @@ def pose_covariance(
     """
     bias = torch.minimum(variance, reference.noise.power)[:, None, None]
     bread = torch.addcmul(normal.bread, bias, normal.bread_bias, value=-1)
-    meat = torch.addcmul(both[:, None, None] * normal.meat, bias, normal.meat_bias, value=-1)
+    meat = torch.addcmul(factor[:, None, None] * normal.meat, bias, normal.meat_bias, value=-1)
     cofactors = torch.linalg.cross(bread.roll(-1, 1), bread.roll(-2, 1))  # the inverse is their transpose / det
     determinant = (bread[:, :1] * cofactors[:, :1]).sum(2, keepdim=True)
     scale = (variance.unsqueeze(1) if scatter is None else scatter).sqrt().unsqueeze(2)
