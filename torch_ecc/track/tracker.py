@@ -310,7 +310,7 @@ def _warn_of_textureless(each: list[bool]) -> None:
     which = [r for r, textureless in enumerate(each) if textureless]
     if which:
         names = f"template {which[0]}" if len(which) == 1 else f"templates {', '.join(map(str, which))}"
-        warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=4)
+        warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=6)
 
 
 def _named(criterion: Criterion) -> str:
