@@ -87,6 +87,19 @@ def test_what_lies_on_a_part_of_an_array_for_a_frame_leads_to_no_other_part(what
         assert watchful.displacement[2:, :, :2].abs().max() < 0.1
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.02])
+def test_less_noise_than_in_the_first_frame_makes_no_look_alike_the_better_one(spread):
+    for seed in range(100, 108):
+        rng = np.random.default_rng(seed)
+        image, middle, size = parts(rng, spread)
+        first = noisy(image + rng.normal(0, 6, image.shape), rng)
+        tracker = Tracker(first, [tuple(middle)], size)
+        hidden = spoilt(image, "hidden", middle, size, rng)
+        for _ in range(2):
+            assert tracker(noisy(hidden, rng)).status != Status.CONVERGED
+        assert tracker(noisy(image, rng)).displacement[0, :2].abs().max() < 0.2
+
+
 def test_dust_of_28_px_on_one_of_many_equal_pads():
     y, x = np.mgrid[0:400, 0:480].astype(float)
     u, v = (x - 210) % 60 - 30, (y - 170) % 60 - 30

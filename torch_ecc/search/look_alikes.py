@@ -38,10 +38,11 @@ class LookAlikes(NamedTuple):
         other = Status.good(found.status) & (distance > SUPPRESSION)
         return LookAlikes(torch.where(other, distance, torch.inf), torch.where(other, found.score, -1.0))
 
-    def nearest(self, score: Tensor) -> Tensor:
-        """How far () the nearest one is that looks as good as a place of ``score`` () or better; inf if none does."""
+    def nearest(self, score: Tensor, raised: Tensor) -> Tensor:
+        """How far () the nearest one is that looks as good as a place of ``score`` () or better, in a frame that has
+        ``raised`` () all scores by that factor since; inf if none does."""
         a, b = EQUAL_MARGIN
-        return torch.where(1 - self.score <= a * (1 - score) + b, self.distance, torch.inf).amin()
+        return torch.where(1 - raised * self.score <= a * (1 - score) + b, self.distance, torch.inf).amin()
 
 
 def look_alikes_near(reference: Reference, image: Tensor, home: Tensor, settings: Settings) -> list[LookAlikes]:

@@ -93,6 +93,7 @@ class Recovery:
     def __init__(self, reference: Reference, settings: Settings, turn: Tensor) -> None:
         self.reference, self.settings = reference, settings
         self.turn = turn  # whose turn it is if they are many, (): the tracker's, written in place
+        self.expected = expected_score(reference)
         self.textureless, self.hopeless = textureless(reference, settings)
         self.locators: dict[int, Locator] = {}  # of the templates last searched for
         self.nearby: tuple[list[int], Nearby] | None = None
@@ -154,8 +155,8 @@ class Recovery:
             return estimate
         radius = self.reference.place.radius[r]
         distance = pose_distance(best.pose[0], pose, radius=radius)
-        others = LookAlikes.around(found, best.pose[0], radius)
-        if distance > NEARER * torch.minimum(others.nearest(best.score[0]), self.twin(r, best.score[0], past, locator)):
+        others = LookAlikes.around(found, best.pose[0], radius).nearest(best.score[0], torch.ones_like(radius))
+        if distance > NEARER * torch.minimum(others, self.twin(r, best.score[0], past, locator)):
             return estimate
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
@@ -169,10 +170,16 @@ class Recovery:
         unseen = [r for r in leapt.tolist() if r not in self.near]
         if unseen:
             self.near |= zip(unseen, self._look_near(unseen, past), strict=True)
-        twin = torch.stack([self.near[r].nearest(found.score[r]) for r in leapt.tolist()])
+        raised = self.raised(found.score, past.usual)
+        twin = torch.stack([self.near[r].nearest(found.score[r], raised[r]) for r in leapt.tolist()])
         distance = pose_distance(found.pose[leapt], start[leapt], radius=self.reference.place.radius[leapt])
         doubtful = leapt[distance > NEARER * twin]
         return found.put(doubtful, before.at(doubtful))
+
+    def raised(self, score: Tensor, usual: Tensor) -> Tensor:
+        """By what factor (R,) scores are higher than they were in the first frame, as far as the ``usual`` one (R,)
+        tells and a place of ``score`` (R,) or (), which would be a look-alike's: there is less noise now."""
+        return (torch.maximum(score, usual) / self.expected.clamp(min=1e-6)).clamp(min=1.0)
 
     def follow(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor) -> Estimate:
         """Where several have been found away from their ``start`` (R, 3) and most have gone the same way, all that have
@@ -198,7 +205,7 @@ class Recovery:
         if r not in self.anywhere:
             first = past.first if len(past.first) == 1 else past.first[r : r + 1]
             self.anywhere[r] = look_alikes_anywhere(locator, first.float(), past.home[r])
-        return self.anywhere[r].nearest(score)
+        return self.anywhere[r].nearest(score, self.raised(score, past.usual)[r])
 
     @lasting
     def _look_near(self, templates: list[int], past: Past) -> list[LookAlikes]:
