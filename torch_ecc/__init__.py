@@ -8,7 +8,7 @@ Conventions: see ``torch_ecc.pose``.
 from torch_ecc.core import pose
 from torch_ecc.core.align import align
 from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
-from torch_ecc.core.estimate import Estimate, Status, Track
+from torch_ecc.core.estimate import Estimate, Origin, Status, Track
 from torch_ecc.core.patches import texture
 from torch_ecc.core.reference import Reference, prepare
 from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
@@ -26,6 +26,7 @@ __all__ = [
     "Estimate",
     "Located",
     "Locator",
+    "Origin",
     "PaperECC",
     "Reference",
     "SequenceError",

@@ -32,6 +32,14 @@ class Status(IntEnum):
         return status <= int(Status.MAX_ITERATIONS)
 
 
+class Origin(IntEnum):
+    """How a pose was come by."""
+
+    TRACKED = 0  # from the expected place, by iterating alone
+    NEARBY = 1  # by a search around the expected place, or where others were found to have gone
+    ANYWHERE = 2  # by a search of the whole frame
+
+
 _SENTENCES = {
     Status.CONVERGED: "The pose is good to the requested tolerance.",
     Status.MAX_ITERATIONS: "The pose was still moving by more than the tolerance when the iterations ran out.",
@@ -47,7 +55,7 @@ class Estimate(NamedTuple):
     ``pose`` (R, 3) px, px, rad; ``displacement`` (R, 3) pose minus the pose at start, theta unwrapped; ``score`` (R,)
     zero-mean normalised correlation in [-1, 1]; ``status`` (R,) int8, see Status; ``iterations`` (R,);
     ``covariance`` (R, 3, 3) of the pose, infinite on the diagonal where the status is a failure; ``residual_rms``
-    (R,) in grey levels of the frame.
+    (R,) in grey levels of the frame; ``origin`` (R,) int8, see Origin: a search's only where it gave the pose.
     """
 
     pose: Tensor
@@ -57,6 +65,7 @@ class Estimate(NamedTuple):
     iterations: Tensor
     covariance: Tensor
     residual_rms: Tensor
+    origin: Tensor
 
     @property
     def sigma(self) -> Tensor:

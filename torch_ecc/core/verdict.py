@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.criteria import safe_inverse
-from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.normal import Normal
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
@@ -70,7 +70,9 @@ def judge(
         pose = torch.where(good[:, None], pose, start)
         covariance = torch.where(good[:, None, None], covariance, _unknown(pose.dtype, pose.device))
     moved = pose - (start if origin is None else origin)
-    return Estimate(pose, moved, score, status, found.iterations, covariance, rms)
+    return Estimate(
+        pose, moved, score, status, found.iterations, covariance, rms, _tracked(len(pose), pose.device).clone()
+    )
 
 
 def decide(amounts: Tensor, settings: Settings) -> Tensor:
@@ -187,3 +189,10 @@ def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = 
 def _unknown(dtype: torch.dtype, device: torch.device) -> Tensor:
     """The covariance of what was not found."""
     return torch.diag(torch.full((3,), inf, dtype=dtype, device=device))
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _tracked(count: int, device: torch.device) -> Tensor:
+    """The origin (B,) of poses that no search has given."""
+    return torch.full((count,), int(Origin.TRACKED), dtype=torch.int8, device=device)

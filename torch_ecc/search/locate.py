@@ -17,7 +17,7 @@ from torch import Tensor
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain
 from torch_ecc.core.criteria import centred, safe_inverse
-from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.frame import as_gray
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.pyramid import pyramid
@@ -171,14 +171,19 @@ class Locator:
                 break
             again = solve(_copies(copies, len(far)), image, estimate.pose[far], self.settings)
             estimate = estimate.put(far, again)
+        estimate = estimate._replace(origin=torch.full_like(estimate.origin, int(Origin.ANYWHERE)))
         return estimate, detrended_zncc_at(copies, image, estimate.pose)
 
-    def coarse(self, images: list[Tensor], b: int) -> Tensor:
-        """Poses (K, 3) of template ``b`` in one frame before they are refined at its full resolution, best first."""
+    def coarse(self, images: list[Tensor], b: int, near: Tensor | None = None) -> Tensor:
+        """Poses (K, 3) of template ``b`` in one frame before they are refined at its full resolution, best first; of
+        many only the SURVIVORS nearest to ``near`` (3,), if that is given."""
         references, bank = self.pyramids[b], self.banks[b]
         top = len(references) - 1
         pose, score = bank.candidates(images[top][0, 0], CANDIDATES)
         pose = pose[shortlist(pose, score, radius=references[top].place.radius, margin=GRID_MARGIN)]
+        if near is not None:
+            place = near / near.new_tensor((2.0**top, 2.0**top, 1.0))
+            pose = pose[pose_distance(pose, place, radius=references[top].place.radius).argsort()[:SURVIVORS]]
         for level in range(top, min(top, 1) - 1, -1):  # the last level is left to the refinement
             pose = aligned(references[level], images[level], pose)
             pose = pose * pose.new_tensor((2.0, 2.0, 1.0)) if level else pose

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.align import solve
-from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.pose import compose, rotation
 from torch_ecc.core.pyramid import as_images
 from torch_ecc.core.reference import Reference
@@ -48,8 +48,8 @@ class Nearby(NamedTuple):
     correlator: Correlator
 
     @staticmethod
-    def of(reference: Reference) -> Nearby:
-        """Of prepared templates."""
+    def of(reference: Reference, half_width: int = HALF_WIDTH) -> Nearby:
+        """Of prepared templates, to look ``half_width`` px to each side."""
         template, (image, weight, corner) = Template.of(reference), as_images(reference)
         h, w = image.shape[-2:]
         middle = corner + corner.new_tensor((w - 1, h - 1)) / 2 - template.centre
@@ -59,7 +59,7 @@ class Nearby(NamedTuple):
             texture, weights = _subsampled(image, weight, spacing)
             if spacing == 1 or _enough(texture, weights, image, weight, spacing):
                 break
-        places = 2 * math.ceil(HALF_WIDTH / spacing) + 3  # with those that are only there to be compared with
+        places = 2 * math.ceil(half_width / spacing) + 3  # with those that are only there to be compared with
         shape = (texture.shape[-2] + places - 1, texture.shape[-1] + places - 1)
         correlator = _correlator(texture, weights, shape)
         return Nearby(spacing, shape, middle.to(template.radius), template.radius, correlator)
@@ -81,14 +81,14 @@ class Nearby(NamedTuple):
                 farther = solve(reference.select(index), images, place[index, k], settings)
                 replaced = better(farther, best.at(index)).nonzero()[:, 0]
                 best = best.put(index[replaced], farther.at(replaced))
-        return best
+        return best._replace(origin=torch.full_like(best.origin, int(Origin.NEARBY)))
 
-    def candidates(self, image: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Where ``image`` (1 or B, 1, H, W) looks most like the templates around ``pose`` (B, 3): (B, CANDIDATES, 3)
-        and the scores (B, CANDIDATES)."""
+    def candidates(self, image: Tensor, pose: Tensor, most: int = CANDIDATES) -> tuple[Tensor, Tensor]:
+        """Where ``image`` (1 or B, 1, H, W) looks most like the templates around ``pose`` (B, 3): (B, ``most``, 3) and
+        the scores (B, ``most``)."""
         surroundings = self._surroundings(image, pose)
         (score,) = self.correlator.scores(surroundings, self.correlator.texture.shape[1])
-        peak = peaks(score, CANDIDATES)
+        peak = peaks(score, most)
         a, h, w = (n - 2 for n in score.shape[1:])
         cell = (peak.place - peak.place.new_tensor((w - 1, h - 1, a - 1)) / 2).to(self.middle)
         step = torch.cat((cell[..., :2] * self.spacing, cell[..., 2:] * ANGLE_STEP), -1)

@@ -1,18 +1,33 @@
-"""Templates that were not found, or look less like themselves than usual, are searched for: near, then anywhere."""
+"""Templates that were not found, or look less like themselves than usual, are searched for: near, then anywhere.
+
+A search must never make it worse. A place that was tracked to, close to where it was expected, is kept unless another
+one is clearly better, and no place is taken that a look-alike of the template may be as well. Where many templates have
+gone together, that is where the others are looked for.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting
-from torch_ecc.core.estimate import Estimate, Status
-from torch_ecc.core.pose import unwrap
+from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, within_margin
+from torch_ecc.core.verdict import NOISE_SHARE, noise_share
+from torch_ecc.search.locate import (
+    LEAST_VISIBLE,
+    Locator,
+    image_pyramid,
+    pose_distance,
+    within_margin,
+)
+from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import Nearby
 
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
@@ -20,6 +35,21 @@ AT_ONCE = 8  # templates searched for in the whole of one frame; the others in t
 NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
 SELDOM = 16  # frames between two searches for what has been lost for long
+NOISE_ALONE = 0.8  # of the information in some direction: no place can be told from the next one
+BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
+FEWEST_TOGETHER = 3  # templates that must have gone the same way for others to be looked for there
+TOGETHER = 3.0  # px: they have gone the same way, and more than half of those that were found have
+
+
+class Past(NamedTuple):
+    """What is known of R templates before a frame: last good ``pose`` (R, 3), ``usual`` score (R,), ``suspect_frames``
+    (R,) in a row, and the ``first`` frame (1 or R, 1, H, W), where they were at ``home`` (R, 3)."""
+
+    pose: Tensor
+    usual: Tensor
+    suspect_frames: Tensor
+    first: Tensor
+    home: Tensor
 
 
 def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
@@ -28,36 +58,75 @@ def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
     return [status > Status.MAX_ITERATIONS or not within_margin(score, most) for status, score, most in each]
 
 
+def plausible(estimate: Estimate, start: Tensor, past: Past, radius: Tensor) -> Tensor:
+    """Places (R,) that were tracked to, look familiar, and lie about as close to the ``start`` (R, 3) as that does to
+    the last pose."""
+    step, last = (pose_distance(start, pose, radius=radius) for pose in (estimate.pose, past.pose))
+    familiar = estimate.score >= FAMILIAR * past.usual
+    return Status.good(estimate.status) & familiar & (step <= BASIN + last)
+
+
+def beats(found: Estimate, hand: Estimate) -> Tensor:
+    """Whether ``found`` places (n, ...) are clearly better than those at ``hand``: bool (n,)."""
+    worse: Tensor = ~within_margin(hand.score, found.score)
+    return ~Status.good(hand.status) | worse
+
+
+def textureless(reference: Reference, settings: Settings) -> tuple[list[bool], list[bool]]:
+    """Templates (B,) that most frames as noisy as themselves find LOW_TEXTURE; and those of them that no search can
+    find: noise is all there is, in some direction, or so much that they would not know themselves again."""
+    share, expected = noise_share(reference, reference.normal), expected_score(reference)
+    hopeless = ~(share <= NOISE_ALONE) | ((share > NOISE_SHARE) & (expected < settings.min_score))
+    return (~(share <= NOISE_SHARE)).tolist(), hopeless.tolist()
+
+
+def expected_score(reference: Reference) -> Tensor:
+    """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
+    noise, normal = reference.noise.level, reference.normal
+    return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
+
+
 class Recovery:
     """The searches of one tracker, and what is prepared for them."""
 
+    @lasting
     def __init__(self, reference: Reference, settings: Settings, turn: Tensor) -> None:
         self.reference, self.settings = reference, settings
         self.turn = turn  # whose turn it is if they are many, (): the tracker's, written in place
+        self.expected = expected_score(reference)
+        self.textureless, self.hopeless = textureless(reference, settings)
         self.locators: dict[int, Locator] = {}  # of the templates last searched for
         self.nearby: tuple[list[int], Nearby] | None = None
+        self.near: dict[int, LookAlikes] = {}  # of templates that a search has led elsewhere, in the first frame
+        self.anywhere: dict[int, LookAlikes] = {}
 
-    def __call__(
-        self, images: list[Tensor], estimate: Estimate, start: Tensor, last: tuple[Tensor, Tensor], frames: Tensor
-    ) -> Estimate:
+    def __call__(self, images: list[Tensor], estimate: Estimate, start: Tensor, past: Past) -> Estimate:
         """The ``estimate`` of a frame with those templates searched for that are suspect and due: at ``start`` (R, 3)
-        first, then in the whole frame. ``images``: the frame, and as many coarser levels as there are already;
-        ``last``: the last good pose (R, 3) and usual score (R,); ``frames`` (R,) in a row that they were suspect for.
+        first, then in the whole frame. ``images``: the frame, and as many coarser levels as there are already.
         """
-        suspects = suspect(estimate, last[1])
-        due = self.due(suspects, frames.tolist())
+        due = self.due(estimate, past)
         if not due:
             return estimate
         images[0] = images[0].float()
-        estimate = self.search_near(images[0], estimate, start, last[1], sorted(due))
-        suspects = suspect(estimate, last[1])
-        for r in [r for r in due if suspects[r]][:AT_ONCE]:
-            estimate = self.search_anywhere(images, estimate, last, r)
-        return estimate
+        found = self.search_near(images[0], estimate, start, past.usual, sorted(due))
+        estimate = self.follow(images[0], self.own(found, estimate, start, past), start, past.usual)
+        suspects = suspect(estimate, past.usual)
+        kept = plausible(estimate, start, past, self.reference.place.radius).tolist()
+        strayed = [r for r in due if suspects[r] and not kept[r]][:AT_ONCE]
+        for r in strayed:
+            estimate = self.search_anywhere(images, estimate, past, r)
+        return self.follow(images[0], estimate, start, past.usual) if strayed else estimate
 
-    def due(self, suspects: list[bool], frames: list[int]) -> list[int]:
-        """Which of the suspect templates to search for in this frame."""
-        due = [r for r, n in enumerate(frames) if suspects[r] and n % min(1 << min(n // PATIENCE, 8), SELDOM) == 0]
+    def due(self, estimate: Estimate, past: Past) -> list[int]:
+        """Which of the suspect templates to search for in this frame: less often those that have a place or too little
+        texture for one, and never those that no search can find."""
+        due = []
+        codes, suspects = estimate.status.tolist(), suspect(estimate, past.usual)
+        for r, (n, code) in enumerate(zip(past.suspect_frames.tolist(), codes, strict=True)):
+            rarely = code <= Status.MAX_ITERATIONS or self.textureless[r]
+            pause = n & (n - 1) if rarely else n % min(1 << min(n // PATIENCE, 8), SELDOM)
+            if suspects[r] and pause == 0 and not self.hopeless[r]:
+                due.append(r)
         if len(due) > AT_ONCE:
             turn = int(self.turn.add_(AT_ONCE).remainder_(len(due)))
             due = due[turn:] + due[:turn]
@@ -69,23 +138,80 @@ class Recovery:
         view = image if len(image) == 1 else image[index]
         found = self.surroundings(due).find(self.reference.select(index), view, start[index], self.settings)
         known = (found.status == Status.CONVERGED) & within_margin(found.score, usual[index])
+        known &= beats(found, estimate.at(index))
         return estimate.put(index[known], found.at(known))
 
-    def search_anywhere(
-        self, images: list[Tensor], estimate: Estimate, last: tuple[Tensor, Tensor], r: int
-    ) -> Estimate:
+    def search_anywhere(self, images: list[Tensor], estimate: Estimate, past: Past, r: int) -> Estimate:
         """Third attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
-        locator, (pose, usual) = self.locator(r, (images[0].shape[-2], images[0].shape[-1])), last
+        locator, pose = self.locator(r, (images[0].shape[-2], images[0].shape[-1])), past.pose[r]
         images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
-        found, score = locator.candidates(views, 0, pose[r])
-        if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * usual[r]:
+        found, score = locator.candidates(views, 0, pose)
+        if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * past.usual[r]:
             return estimate
-        if Status.good(estimate.status[r]) and within_margin(estimate.score[r], found.score[0]):
-            return estimate
-        best = found._replace(pose=torch.cat((found.pose[:, :2], unwrap(found.pose[:, 2:], pose[r, 2])), -1))
         index = torch.tensor([r], device=pose.device)
-        return estimate.put(index, best.at(index.new_zeros(1)))
+        best = found.at(index.new_zeros(1))
+        if not beats(best, estimate.at(index)):
+            return estimate
+        radius = self.reference.place.radius[r]
+        distance = pose_distance(best.pose[0], pose, radius=radius)
+        others = LookAlikes.around(found, best.pose[0], radius).nearest(best.score[0], torch.ones_like(radius))
+        if distance > NEARER * torch.minimum(others, self.twin(r, best.score[0], past, locator)):
+            return estimate
+        turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
+        return estimate.put(index, best._replace(pose=turned))
+
+    def own(self, found: Estimate, before: Estimate, start: Tensor, past: Past) -> Estimate:
+        """``found`` without the leaps from the ``start`` (R, 3) to where look-alikes of the templates may be as well:
+        these are as ``before``."""
+        leapt = (found.origin != before.origin).nonzero()[:, 0]
+        if len(leapt) == 0:
+            return found
+        unseen = [r for r in leapt.tolist() if r not in self.near]
+        if unseen:
+            self.near |= zip(unseen, self._look_near(unseen, past), strict=True)
+        raised = self.raised(found.score, past.usual)
+        twin = torch.stack([self.near[r].nearest(found.score[r], raised[r]) for r in leapt.tolist()])
+        distance = pose_distance(found.pose[leapt], start[leapt], radius=self.reference.place.radius[leapt])
+        doubtful = leapt[distance > NEARER * twin]
+        return found.put(doubtful, before.at(doubtful))
+
+    def raised(self, score: Tensor, usual: Tensor) -> Tensor:
+        """By what factor (R,) scores are higher than they were in the first frame, as far as the ``usual`` one (R,)
+        tells and a place of ``score`` (R,) or (), which would be a look-alike's: there is less noise now."""
+        return (torch.maximum(score, usual) / self.expected.clamp(min=1e-6)).clamp(min=1.0)
+
+    def follow(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor) -> Estimate:
+        """Where several have been found away from their ``start`` (R, 3) and most have gone the same way, all that have
+        not are tried there."""
+        expected = None if len(image) > 1 else gone_together(estimate, start)
+        if expected is None:
+            return estimate
+        good = Status.good(estimate.status)
+        off = torch.hypot(*(estimate.pose - expected)[:, :2].T) > TOGETHER
+        doubted = torch.tensor(suspect(estimate, usual), device=start.device) | (estimate.origin != Origin.TRACKED)
+        index = (doubted & (off | ~good)).nonzero()[:, 0]
+        if len(index) == 0:
+            return estimate
+        found = solve(self.reference.select(index), image, expected[index], self.settings)
+        known = (found.status == Status.CONVERGED) & within_margin(found.score, usual[index])
+        known &= ~good[index] | within_margin(found.score, estimate.score[index])
+        found = found._replace(origin=torch.full_like(found.origin, int(Origin.NEARBY)))
+        return estimate.put(index[known], found.at(known))
+
+    def twin(self, r: int, score: Tensor, past: Past, locator: Locator) -> Tensor:
+        """How far () from template ``r`` the nearest look-alike in the first frame is that is as good as a ``score``
+        ()."""
+        if r not in self.anywhere:
+            first = past.first if len(past.first) == 1 else past.first[r : r + 1]
+            self.anywhere[r] = look_alikes_anywhere(locator, first.float(), past.home[r])
+        return self.anywhere[r].nearest(score, self.raised(score, past.usual)[r])
+
+    @lasting
+    def _look_near(self, templates: list[int], past: Past) -> list[LookAlikes]:
+        index = torch.tensor(templates, device=past.home.device)
+        first = past.first if len(past.first) == 1 else past.first[index]
+        return look_alikes_near(self.reference.select(index), first.float(), past.home[index], self.settings)
 
     @lasting
     def surroundings(self, due: list[int]) -> Nearby:
@@ -104,3 +230,22 @@ class Recovery:
             template = self.reference.select(torch.tensor([r], device=self.reference.K.device))
             self.locators[r] = Locator(template, size, replace(self.settings, min_visible=LEAST_VISIBLE))
         return self.locators[r]
+
+
+def gone_together(estimate: Estimate, start: Tensor) -> Tensor | None:
+    """Where all templates are expected (R, 3) if they have moved from the ``start`` (R, 3) as most of those that a
+    search has found; None if these are few or have not gone the same way."""
+    found = (estimate.origin != Origin.TRACKED) & Status.good(estimate.status)
+    count = int(found.sum())
+    if count < FEWEST_TOGETHER:
+        return None
+    expected = compose(common_motion(start[found], estimate.pose[found]).expand_as(start), start)
+    agree = torch.hypot(*(estimate.pose - expected)[found, :2].T) <= TOGETHER
+    return expected if int(agree.sum()) >= max(FEWEST_TOGETHER, count // 2 + 1) else None
+
+
+def common_motion(start: Tensor, pose: Tensor) -> Tensor:
+    """The motion (3,) of the frame that takes poses ``start`` (n, 3) to ``pose`` (n, 3), or most of them: medians."""
+    angle = (pose - start)[:, 2].median()
+    shift = pose[:, :2] - (rotation(angle) @ start[:, :2].mT).mT
+    return torch.cat((shift.median(0).values, angle[None]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, Self
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain
 from torch_ecc.core.criteria import Criterion, make_criterion
-from torch_ecc.core.estimate import Estimate, Status, Track
+from torch_ecc.core.estimate import Estimate, Origin, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
 from torch_ecc.core.patches import Centers, Crop, Size, crop, locate_patches
 from torch_ecc.core.pose import ahead
@@ -21,7 +22,7 @@ from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
-from torch_ecc.track.recover import Recovery, suspect
+from torch_ecc.track.recover import Past, Recovery, expected_score, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
@@ -46,10 +47,10 @@ class Tracker(nn.Module):
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
     the frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in the frame
-    it is out of view; ``search``: look for a template that is lost, or looks
-    less like itself than usual, near where it is expected and then in the whole frame at any angle: in every frame at
-    first, and ever more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or
-    "native", see settings.Settings.
+    it is out of view; ``search``: look for a template that is lost, or looks less like itself than usual, near where it
+    is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
+    more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or "native", see
+    settings.Settings.
 
     What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
     with its own options. A state comes whole or not at all; what does not fit is refused before anything is changed.
@@ -61,6 +62,7 @@ class Tracker(nn.Module):
     template: Tensor
     mask: Tensor
     centre: Tensor
+    first: Tensor
     start: Tensor
     pose: Tensor
     velocity: Tensor
@@ -105,6 +107,7 @@ class Tracker(nn.Module):
         none = torch.zeros_like(start[:, 0], dtype=torch.int64)
         for name, value in templates._asdict().items():
             self.register_buffer(name, value)
+        self.register_buffer("first", _kept(gray))  # frame: what else in it looks like them?
         self.register_buffer("start", start)  # of every template, all (R, 3), px, px, rad
         self.register_buffer("pose", start.clone())  # the last good one
         self.register_buffer("velocity", torch.zeros_like(start))  # what the last step has added to it
@@ -113,6 +116,7 @@ class Tracker(nn.Module):
         self.register_buffer("turn", none[0].clone())  # (): which of many lost ones is searched for next
         self._use(self._prepared(*templates))
         self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
+        _warn_of_textureless(self._recovery.textureless)
 
     @classmethod
     @plain
@@ -132,6 +136,7 @@ class Tracker(nn.Module):
         settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
         tracker.frame_shape = tuple(view.shape)
+        tracker.register_buffer("first", _kept(view))
         tracker.start.copy_(located.pose)
         tracker.pose.copy_(located.pose)
         return tracker, located
@@ -224,12 +229,13 @@ class Tracker(nn.Module):
         images = [image]
         estimate = self._solve(images, start)
         suspects = suspect(estimate, state["score"])
-        if any(suspects) and self.search:
-            last = state["pose"], state["score"]
-            estimate = self._recovery(images, estimate, start, last, state["suspect_frames"])
-            estimate = estimate._replace(displacement=estimate.pose - state["start"])
+        if not any(suspects):
+            return self._advance(estimate)
+        if self.search:
+            past = Past(*(state[name] for name in ("pose", "score", "suspect_frames", "first", "start")))
+            estimate = self._recovery(images, estimate, start, past)
             suspects = suspect(estimate, state["score"])
-        return self._advance(estimate, suspects)
+        return self._advance_doubtful(estimate, suspects)
 
     def track(self, frame: Tensor) -> Estimate:
         """Same as calling the tracker."""
@@ -266,32 +272,45 @@ class Tracker(nn.Module):
             pose = torch.where(better[:, None], state.pose * scale, pose)
         return solve(self.references[0], images[0], pose, self.settings, self._buffers["start"])
 
-    def _advance(self, estimate: Estimate, suspects: list[bool]) -> Estimate:
-        """One frame on: the next state, and the ``estimate`` with the last good pose of what was not found."""
+    def _advance(self, estimate: Estimate) -> Estimate:
+        """One frame on, in which nothing is suspect: the next state, and the ``estimate``."""
         state: Any = self._buffers
-        last, usual, pose, tracked = state["pose"], state["score"], estimate.pose, state["tracked"]
-        step = (pose - last).mul_(tracked.unsqueeze(1))
-        if any(suspects):
-            good = Status.good(estimate.status)
-            pose = torch.where(good[:, None], pose, last)
-            estimate = estimate._replace(pose=pose, displacement=pose - state["start"])
-            usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
-            step = torch.where(good[:, None], step, 0.0)
-            tracked.copy_(good)
-            state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
-        else:  # the same, in fewer steps
-            usual.lerp_(estimate.score, MEMORY)
-            tracked.fill_(1)
-            state["suspect_frames"].zero_()
+        last, tracked = state["pose"], state["tracked"]
+        step = (estimate.pose - last).mul_(tracked.unsqueeze(1))
+        state["score"].lerp_(estimate.score, MEMORY)
+        tracked.fill_(1)
+        state["suspect_frames"].zero_()
         state["velocity"].copy_(step)
-        last.copy_(pose)
+        last.copy_(estimate.pose)
         return estimate
 
+    def _advance_doubtful(self, estimate: Estimate, suspects: list[bool]) -> Estimate:
+        """The same where some are suspect or were, with the last good pose of what was not found. What a search has
+        found is no step: it tells nothing of the velocity."""
+        state: Any = self._buffers
+        last, usual, tracked = state["pose"], state["score"], state["tracked"]
+        good = Status.good(estimate.status)
+        pose = torch.where(good[:, None], estimate.pose, last)
+        usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
+        stepped = good & (estimate.origin == Origin.TRACKED) & (tracked > 0)
+        state["velocity"].copy_(torch.where(stepped[:, None], pose - last, 0.0))
+        tracked.copy_(good)
+        state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
+        last.copy_(pose)
+        return estimate._replace(pose=pose, displacement=pose - state["start"])
 
-def expected_score(reference: Reference) -> Tensor:
-    """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
-    noise, normal = reference.noise.level, reference.normal
-    return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
+
+def _kept(frame: Tensor) -> Tensor:
+    """A frame (1 or R, 1, H, W) in half the memory, good enough to look for look-alikes in: float16 about its mean."""
+    gray = frame - frame.mean((2, 3), keepdim=True)
+    return (gray / gray.square().mean((2, 3), keepdim=True).sqrt().clamp(min=1e-30)).clamp(-1e4, 1e4).half()
+
+
+def _warn_of_textureless(each: list[bool]) -> None:
+    which = [r for r, textureless in enumerate(each) if textureless]
+    if which:
+        names = f"template {which[0]}" if len(which) == 1 else f"templates {', '.join(map(str, which))}"
+        warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=6)
 
 
 def _named(criterion: Criterion) -> str:

@@ -1,0 +1,232 @@
+"""Laws of the searches of a tracker: they never make it worse, a leap is no velocity, and many go together."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import torch_ecc as te
+from torch_ecc import Origin, Status, Tracker
+from torch_ecc.core.pose import compose
+from torch_ecc.io import open_frames
+from torch_ecc.sim.scene.scene import PlaneWaves
+from torch_ecc.track.recover import Recovery, common_motion, gone_together
+
+FRAME = (240, 320)
+Y, X = np.mgrid[0 : FRAME[0], 0 : FRAME[1]].astype(float)
+SCENE = PlaneWaves.random(seed=5)
+
+
+def edge(distance):
+    return 1 / (1 + np.exp(-distance / 0.8))
+
+
+def noisy(image: np.ndarray, rng: np.random.Generator) -> torch.Tensor:
+    return torch.from_numpy(np.rint(image + rng.normal(0, 2, image.shape)).clip(0, 255).astype(np.uint8))
+
+
+def still(*steps: tuple[float, float, float], start=(160.0, 120.0, 0.0)) -> torch.Tensor:
+    """Frames (F, 240, 320) uint8 of the waves at ``start`` plus each of ``steps`` (px, px, deg)."""
+    poses = torch.tensor([[start[0] + x, start[1] + y, start[2] + math.radians(a)] for x, y, a in steps]).double()
+    return SCENE.render(poses, FRAME)[:, 0].round().clamp(0, 255).to(torch.uint8)
+
+
+def parts(rng: np.random.Generator, spread: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """An array of parts of random pitch and shape, which differ by ``spread`` in brightness; the middle of one of them
+    and the size of a template around it."""
+    pitch, middle = rng.integers(34, 72, 2), np.array([160.0, 120.0])
+    half = rng.uniform(7, 0.32 * pitch)
+    column, row = np.rint((X - middle[0]) / pitch[0]).astype(int), np.rint((Y - middle[1]) / pitch[1]).astype(int)
+    u, v = X - middle[0] - column * pitch[0], Y - middle[1] - row * pitch[1]
+    bright = rng.uniform(60, 110) * (1 + spread * rng.normal(size=(41, 41)))[column + 20, row + 20]
+    lead = 45 * edge(3 - abs(u - half[0] / 3)) * edge(abs(v) - 0.7 * half[1])
+    image = 70 + bright * edge(half[0] - abs(u)) * edge(half[1] - abs(v)) + lead
+    return image, middle, int(np.clip(pitch.min() + rng.integers(-6, 20), 31, 81))
+
+
+def spoilt(image: np.ndarray, what: str, middle: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+    x, y = middle + rng.uniform(-0.35, 0.35, 2) * size
+    distance, turn = np.hypot(X - x, Y - y), rng.uniform(0, math.pi)
+    along, across = (
+        (X - x) * math.cos(turn) + (Y - y) * math.sin(turn),
+        (X - x) * math.sin(turn) - (Y - y) * math.cos(turn),
+    )
+    covered = {
+        "dust": (distance < 3, 20),
+        "glint": (distance < rng.uniform(2, 5), 250),
+        "needle": ((abs(across) < 1) & (along > 0), 30),
+        "cover": (X - middle[0] > rng.uniform(0.2, 0.4) * size, 90),
+        "hidden": ((abs(X - middle[0]) < 0.6 * size) & (abs(Y - middle[1]) < 0.6 * size), 90),
+    }
+    if what == "lamp":
+        return image + 90 * np.exp(-((distance / (size / 5)) ** 2) / 2)
+    where, level = covered[what]
+    return np.where(where, level, image)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.05], ids=["equal", "nearly equal"])
+@pytest.mark.parametrize("what", ["dust", "glint", "lamp", "needle", "cover", "hidden"])
+def test_what_lies_on_a_part_of_an_array_for_a_frame_leads_to_no_other_part(what, spread):
+    """Six arrays each: the search changes nothing, and in clean frames again nothing is wrong and believed."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        image, middle, size = parts(rng, spread)
+        first, *rest = (
+            noisy(each, rng) for each in (image, image, spoilt(image, what, middle, size, rng), image, image)
+        )
+        watchful, plain = (
+            Tracker(first, [tuple(middle)], size, search=on).track_sequence(rest) for on in (True, False)
+        )
+        assert (watchful.pose - plain.pose).abs().max() < 1e-6
+        assert (watchful.status[2:] == Status.CONVERGED).all()
+        assert watchful.displacement[2:, :, :2].abs().max() < 0.1
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.02])
+def test_less_noise_than_in_the_first_frame_makes_no_look_alike_the_better_one(spread):
+    for seed in range(100, 108):
+        rng = np.random.default_rng(seed)
+        image, middle, size = parts(rng, spread)
+        first = noisy(image + rng.normal(0, 6, image.shape), rng)
+        tracker = Tracker(first, [tuple(middle)], size)
+        hidden = spoilt(image, "hidden", middle, size, rng)
+        for _ in range(2):
+            assert tracker(noisy(hidden, rng)).status != Status.CONVERGED
+        assert tracker(noisy(image, rng)).displacement[0, :2].abs().max() < 0.2
+
+
+def test_dust_of_28_px_on_one_of_many_equal_pads():
+    y, x = np.mgrid[0:400, 0:480].astype(float)
+    u, v = (x - 210) % 60 - 30, (y - 170) % 60 - 30
+    pads = 70 + 100 * edge(18 - abs(u)) * edge(14 - abs(v)) + 45 * edge(3 - abs(u - 8)) * edge(abs(v) - 14)
+    dusty = np.where(np.hypot(x - 246, y - 195) < 3, 20, pads)
+    rng = np.random.default_rng(0)
+    tracker = Tracker(noisy(pads, rng), [(240.0, 200.0)], 61)
+    for image in (pads, dusty, pads, pads, pads):
+        estimate = tracker(noisy(image, rng))
+        assert estimate.status == Status.CONVERGED
+        assert estimate.origin == Origin.TRACKED
+        assert (estimate.pose[0, :2] - torch.tensor([240.0, 200.0])).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("lost", [1, 5])
+def test_a_hidden_template_is_not_taken_for_its_twin(lost):
+    """Which is alone in sight as long as the template is hidden, and known from the first frame."""
+    image = PlaneWaves.random(seed=31).render(torch.zeros(1, 3).double(), FRAME)[0, 0]
+    tile = SCENE.render(torch.tensor([[30.0, 30.0, 0.0]]).double(), (61, 61))[0, 0]
+    for x in (30, 200):
+        image[70:131, x : x + 61] = tile
+    hidden = image.clone()
+    hidden[60:141, 20:101] = 128
+    tracker = Tracker(image, [(60.0, 100.0)], 61)
+    for _ in range(lost):
+        assert tracker(hidden).status == Status.LOST
+    assert tracker(image).displacement.abs().max() < 1e-3
+
+
+def test_a_leap_is_no_velocity():
+    """Found 14 px on, and there in the next frame; then it moves by 2 px per frame, which is one."""
+    stack = still((0, 0, 0), (14, 0, 0), (14, 0, 0), (16, 0, 0), (18, 0, 0))
+    tracker = Tracker(stack[0], [(160.0, 120.0)], 61)
+    assert tracker(stack[1]).origin == Origin.NEARBY
+    assert torch.equal(tracker.velocity, torch.zeros(1, 3).double())
+    for k in (2, 3, 4):
+        estimate = tracker(stack[k])
+        assert estimate.origin == Origin.TRACKED
+        assert float(tracker.velocity[0, 0]) == pytest.approx(0.0 if k == 2 else 2.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("step", "origin"),
+    [((1, 1, 0), Origin.TRACKED), ((12, -9, 3), Origin.NEARBY), ((60, 30, 50), Origin.ANYWHERE)],
+)
+def test_the_origin_says_how_a_pose_was_come_by(step, origin):
+    frames = still((0, 0, 0), step)
+    estimate = Tracker(frames[0], [(160.0, 120.0)], 61)(frames[1])
+    assert estimate.status == Status.CONVERGED
+    assert estimate.origin.dtype == torch.int8
+    assert estimate.origin.tolist() == [origin]
+    reference = te.prepare(frames[0][90:151, 130:191])
+    assert te.align(reference, frames[1], estimate.pose).origin.tolist() == [Origin.TRACKED]
+    assert te.locate(reference, frames[1]).estimate.origin.tolist() == [Origin.ANYWHERE]
+
+
+def test_a_score_that_falls_smoothly_is_searched_for_a_few_times_only(monkeypatch):
+    """Noise that grows from frame to frame: the place is kept and the whole frame never searched."""
+    near = []
+    look = Recovery.search_near
+    monkeypatch.setattr(Recovery, "search_near", lambda self, *a: near.append(1) or look(self, *a))
+    monkeypatch.setattr(Recovery, "search_anywhere", None)
+    frame, generator = still((0, 0, 0))[0], torch.Generator().manual_seed(0)
+    tracker = Tracker(frame, [(160.0, 120.0)], 61)
+    for k in range(40):
+        estimate = tracker((frame + 0.4 * k * torch.randn(FRAME, generator=generator)).clamp(0, 255))
+        assert estimate.status == Status.CONVERGED
+    assert len(near) <= 8
+
+
+def flat(rng: np.random.Generator) -> torch.Tensor:
+    return noisy(100 + 80 * edge(X - 250) + 60 * edge(12 - abs(X - 60)) * edge(9 - abs(Y - 120)), rng)
+
+
+@pytest.mark.parametrize(
+    ("x", "size", "most"), [(160.0, 61, 0), (250.0, 61, 0), (250.0, 31, 7)], ids=["nothing", "edge", "short edge"]
+)
+def test_a_patch_without_texture_is_told_and_hardly_searched_for(x, size, most, monkeypatch):
+    """Where no search can find it never; where that is not so sure in the frames 1, 2, 3, 5, 9, 17 and 33."""
+    rng, searched = np.random.default_rng(0), []
+    with pytest.warns(UserWarning, match=r"Tracker: template 1: The template has too little texture"):
+        tracker = Tracker(flat(rng), [(60.0, 120.0), (x, 120.0)], size)
+    monkeypatch.setattr(Recovery, "search_near", lambda self, image, estimate, *_: searched.append(1) or estimate)
+    monkeypatch.setattr(Recovery, "search_anywhere", lambda self, images, estimate, past, r: estimate)
+    for _ in range(40):
+        assert tracker(flat(rng)).status.tolist() == [Status.CONVERGED, Status.LOW_TEXTURE]
+    assert len(searched) == most
+
+
+def test_good_patches_bring_no_warning():
+    frame = still((0, 0, 0))[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Tracker(frame, [(160.0, 120.0), (100.0, 100.0)], 41)
+
+
+def test_the_common_motion_is_that_of_most():
+    """Any turn about any point, and a third that went elsewhere."""
+    generator = torch.Generator().manual_seed(0)
+    start = torch.rand(15, 3, generator=generator).double() * torch.tensor([300.0, 200.0, 6.0])
+    motion = torch.tensor([[14.0, -31.0, 0.2]]).double()
+    pose = compose(motion.expand_as(start), start)
+    pose[:5] += torch.tensor([40.0, 7.0, 1.0])
+    assert (common_motion(start, pose) - motion).abs().max() < 1e-9
+
+
+def test_few_or_scattered_leaps_tell_nothing_of_the_others():
+    frames = still((0, 0, 0), (1, 0, 0))
+    estimate = Tracker(frames[0], [(60.0 + 20 * k, 120.0) for k in range(8)], 41)(frames[1])
+    start, found = estimate.pose - torch.tensor([9.0, 9.0, 0.0]), torch.arange(8) < 2
+    leapt = estimate._replace(origin=found.to(torch.int8))
+    assert gone_together(leapt, start) is None  # two of them
+    scattered = estimate._replace(origin=estimate.origin + 1, pose=estimate.pose * torch.arange(8)[:, None])
+    assert gone_together(scattered, start) is None
+    together = gone_together(estimate._replace(origin=estimate.origin + 1), start)
+    assert (together - estimate.pose).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("last", [3, 4], ids=["25 px", "50 px"])
+def test_where_many_jump_the_others_are_found_by_the_motion_of_some(data, last):
+    """200 patches of 31 px of a speckled plate, beyond the reach of the search near."""
+    folder = data / "pyvale_rigid"
+    truth = json.loads((folder / "truth.json").read_text())["frames"][last]
+    first, second = (next(iter(open_frames(str(folder / name)))) for name in ("ref.png", f"f{last:03d}.png"))
+    corner, span = torch.tensor([20.0, 80.0]), torch.tensor([149.0, 299.0])
+    centers = corner + span * torch.rand(200, 2, generator=torch.Generator().manual_seed(0))
+    estimate = Tracker(first, centers, 31)(second)
+    assert (estimate.status == Status.CONVERGED).all()
+    assert (estimate.origin != Origin.TRACKED).all()
+    assert (estimate.displacement[:, :2] - torch.tensor([truth["tx"], truth["ty"]])).abs().max() < 0.05
