@@ -136,7 +136,8 @@ def _say_numbers(outcome: Any) -> None:
     if limited:
         console.print(f"{outcome.name}: {len(limited) - len(missed)} of {len(limited)} numbers are within their limits")
     for record in missed:
-        text = f"  not kept: {record.name}: {record.value:.4g} {record.unit}, limit {record.tolerance:.4g}"
+        sign = ">=" if record.better == "higher" else "<="
+        text = f"  not kept: {record.name}: {record.value:.4g} {record.unit}, limit {sign} {record.tolerance:.4g}"
         console.print(text, soft_wrap=True, markup=False)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.estimate import Estimate, Origin, Status
-from torch_ecc.core.normal import Normal
+from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
@@ -25,7 +25,6 @@ NOISE_SHARE = 0.6  # of the information in some direction is the template's nois
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 DOUBTFUL_SHARE = 0.5  # of the information, as the likely reason why a template was not found
 PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light is rounding
-LEAST = 1e-30  # what is divided by is at least so much
 
 # The tests of ``decide`` in their order, and what the first one that fails tells.
 VERDICTS = (
