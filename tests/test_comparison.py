@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from torch_ecc.core.pose import rotation
@@ -62,6 +62,7 @@ def test_the_scatter_agrees_with_the_covariance():
     assert torch.allclose(rms, torch.tensor([5e-3, 5e-3, 5e-6]).double(), rtol=0.05)
 
 
+@example(0.0390625, 0.3550873852102767, 0.0)  # a step that was small by chance before the weights had settled
 @settings(max_examples=6, deadline=None)
 @given(st.floats(-0.05, 0.05), st.floats(-0.5, 0.5), st.floats(-50, 50))
 def test_clock_axes_and_zero_of_the_track_do_not_matter(later, turn, shift):

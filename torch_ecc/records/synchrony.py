@@ -115,8 +115,9 @@ def align_records(track: Motion, sensors: Motion, unknowns: Unknowns | None = No
         residual, jacobian, _ = model(p)
         step, _ = _solve(residual, jacobian, weight)
         p[model.free] -= step
-        weight = 1 / residual.square().mean(0).sqrt().maximum(p.new_tensor(FLOOR))
-        converged = bool((step.abs() <= 1e-9 * (1 + p[model.free].abs())).all())
+        used, weight = weight, 1 / residual.square().mean(0).sqrt().maximum(p.new_tensor(FLOOR))
+        settled = ((used / weight - 1).abs() <= 1e-6).all()  # under new weights the next step is no longer small
+        converged = bool(settled and (step.abs() <= 1e-9 * (1 + p[model.free].abs())).all())
         if converged:
             break
     residual, jacobian, valid = model(p)
