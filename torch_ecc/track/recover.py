@@ -19,14 +19,8 @@ from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.verdict import NOISE_SHARE, noise_share
-from torch_ecc.search.locate import (
-    LEAST_VISIBLE,
-    Locator,
-    image_pyramid,
-    pose_distance,
-    within_margin,
-)
+from torch_ecc.core.verdict import NOISE_SHARE, expected_score, noise_share, within_margin
+from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import Nearby
 
@@ -80,18 +74,13 @@ def textureless(reference: Reference, settings: Settings) -> tuple[list[bool], l
     return (~(share <= NOISE_SHARE)).tolist(), hopeless.tolist()
 
 
-def expected_score(reference: Reference) -> Tensor:
-    """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
-    noise, normal = reference.noise.level, reference.normal
-    return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
-
-
 class Recovery:
     """The searches of one tracker, and what is prepared for them."""
 
     @lasting
     def __init__(self, reference: Reference, settings: Settings, turn: Tensor) -> None:
-        self.reference, self.settings = reference, settings
+        # A wrong place must not be made right by leaving out what does not fit.
+        self.reference, self.settings = reference, replace(settings, robust=False)
         self.turn = turn  # whose turn it is if they are many, (): the tracker's, written in place
         self.expected = expected_score(reference)
         self.textureless, self.hopeless = textureless(reference, settings)
