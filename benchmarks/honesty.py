@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 
 import torch
 from adapters import Start
-from films import Film
+from films.shot import Film, Shot, sense
+from films.soak import soak_film, stream
+from scaling import peak_mb
 from torch import Tensor
 
 from torch_ecc import Status, Tracker
@@ -68,6 +70,23 @@ def follow(film: Film, **options: Any) -> Run:
         seconds.append(time.perf_counter() - begun)
     pose, sigma, status = (torch.stack([getattr(e, n) for e in estimates]) for n in ("pose", "sigma", "status"))
     return Run(film, in_degrees(pose - film.truth), in_degrees(sigma), status, torch.tensor(seconds))
+
+
+def soak(shot: Shot, count: int, **options: Any) -> tuple[Run, float]:
+    """The Tracker on ``count`` frames of a stream, and by how many MB its peak memory grew after the first tenth."""
+    start, settled = sense(shot.clean[:1], shot.seed)[0], 0.0
+    tracker = Tracker(start, shot.path[:1, :2], shot.size, **options)
+    pose, sigma, truth = torch.zeros(3, count, 3, dtype=torch.float64)
+    status, (seen, seconds) = torch.zeros(count, dtype=torch.int8), torch.zeros(2, count)
+    for k, (frame, truth[k], seen[k]) in enumerate(stream(shot, count)):
+        begun = time.perf_counter()
+        estimate = tracker(frame)
+        seconds[k] = time.perf_counter() - begun
+        pose[k], sigma[k], status[k] = estimate.pose[0], estimate.sigma[0], estimate.status[0]
+        settled = peak_mb() if k == count // 10 else settled
+    error, sigma = in_degrees(pose - truth), in_degrees(sigma)
+    film = soak_film(shot, truth, seen)
+    return Run(film, error[:, None], sigma[:, None], status[:, None], seconds), peak_mb() - settled
 
 
 def follow_peer(film: Film, start: Start) -> Run:

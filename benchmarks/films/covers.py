@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import torch
-from films import Film, Shot
 from torch import Tensor
 
+from films.shot import FIRST, LAST, Film, Shot, frames
 from torch_ecc.sim import Occluder, PlaneWaves, placed
 
-FIRST, LAST = 5, 32  # frames with a cover that comes and goes at once
 PASSING = 8.0  # px per frame of one that comes in and leaves
 DARK = 30.0  # grey levels
 KINDS = ("flat", "textured", "mean")
@@ -18,19 +17,23 @@ MOTIONS = ("still", "moving", "passing")
 def cover(shot: Shot, share: float, kind: str, motion: str) -> Film:
     """A strip over the whole height or width of the template that covers a ``share`` of it. It is DARK and flat,
     textured, or of the template's mean, and stands still, drifts across the template or comes in and leaves."""
-    strip = placed_strip(shot, share, motion)
-    indices = torch.arange(len(shot.path))
-    opacity = strip.cover(torch.zeros_like(shot.clean), indices)
-    image = torch.lerp(shot.clean, surface(shot, strip, kind), opacity)
+    image, opacity = covered(shot, share, kind, motion)
     return shot.film(image, opacity > 0.5)
+
+
+def covered(shot: Shot, share: float, kind: str, motion: str) -> tuple[Tensor, Tensor]:
+    """The pictures with the strip, and its opacity, (F + 1, 1, h, w) each."""
+    strip = placed_strip(shot, share, motion)
+    opacity = strip.cover(torch.zeros_like(shot.clean), torch.arange(len(shot.path)))
+    return torch.lerp(shot.clean, surface(shot, strip, kind), opacity), opacity
 
 
 def placed_strip(shot: Shot, share: float, motion: str) -> Occluder:
     """The strip; where its centre may lie leaves all of it inside the template in every frame."""
-    middle, travel = shot.path[:, :2].mean(0), (shot.path[:, :2] - shot.path[:, :2].mean(0)).abs().amax(0)
+    middle = shot.path[:, :2].mean(0)
     axis, side = shot.seed % 2, 1 - shot.seed // 2 % 2 * 2  # left to right, top to bottom, and back
-    width = share * shot.size
-    room = max((shot.size - width) / 2 - float(travel[axis]), 0.0)
+    travel, width = float((shot.path[:, axis] - middle[axis]).abs().max()), share * shot.size
+    room = max((shot.size - width) / 2 - travel, 0.0)
     half, center, velocity = [2.0 * shot.size] * 2, middle.tolist(), [0.0, 0.0]
     half[axis], first, last = width / 2, FIRST, LAST
     if motion == "still":
@@ -40,8 +43,7 @@ def placed_strip(shot: Shot, share: float, motion: str) -> Occluder:
         center[axis] -= side * room + FIRST * velocity[axis]
     else:
         velocity[axis] = side * PASSING
-        reach = shot.size / 2 + float(travel[axis]) + width / 2
-        center[axis] -= side * reach + FIRST * velocity[axis]
+        center[axis] -= side * (shot.size / 2 + travel + width / 2) + FIRST * velocity[axis]
         first, last = 0, None
     return Occluder((center[0], center[1]), (half[0], half[1]), 1.0, (velocity[0], velocity[1]), first=first, last=last)
 
@@ -51,8 +53,6 @@ def surface(shot: Shot, strip: Occluder, kind: str) -> Tensor:
     if kind == "flat":
         return torch.full((1, 1, 1, 1), DARK)
     if kind == "mean":
-        x, y, n = *shot.path[0, :2].long().tolist(), shot.size // 2
-        return shot.clean[:1, :, y - n : y + n + 1, x - n : x + n + 1].mean((2, 3), keepdim=True)
-    index = torch.arange(len(shot.path), dtype=torch.float64)[:, None]
-    drift = torch.cat((index * index.new_tensor(strip.velocity), 0 * index), 1)
+        return shot.patch(shot.clean).mean()[None, None, None, None]
+    drift = frames(len(shot.path))[:, None] * torch.tensor((*strip.velocity, 0.0))
     return PlaneWaves.random(seed=1000 + shot.seed).render(placed(drift, strip.center), shot.frame)
