@@ -15,7 +15,7 @@ from films.soak import soak_film, stream
 from scaling import peak_mb
 from torch import Tensor
 
-from torch_ecc import Status, Tracker
+from torch_ecc import Estimate, Origin, Status, Track, Tracker
 from torch_ecc.paper.errors import in_degrees
 from torch_ecc.paper.result import Number
 
@@ -36,13 +36,21 @@ BY: dict[str, dict[str, Any]] = {
 
 
 class Run(NamedTuple):
-    """One tracker on one film: ``error`` and ``sigma`` (F, R, 3) px, px, deg, ``status`` (F, R), ``seconds`` (F,)."""
+    """One tracker on one film: ``error`` and ``sigma`` (F, R, 3) px, px, deg, ``seconds`` (F,), all else (F, R)."""
 
     film: Film
     error: Tensor
     sigma: Tensor
     status: Tensor
+    score: Tensor
+    origin: Tensor
     seconds: Tensor
+
+    @staticmethod
+    def of(film: Film, told: Estimate, seconds: Tensor) -> Run:
+        """What a tracker ``told`` of the frames of a film, (F, R, ...)."""
+        error = in_degrees(told.pose - film.truth)
+        return Run(film, error, in_degrees(told.sigma), told.status, told.score, told.origin, seconds)
 
     @property
     def believed(self) -> Tensor:
@@ -68,25 +76,25 @@ def follow(film: Film, **options: Any) -> Run:
         begun = time.perf_counter()
         estimates.append(tracker(frame))
         seconds.append(time.perf_counter() - begun)
-    pose, sigma, status = (torch.stack([getattr(e, n) for e in estimates]) for n in ("pose", "sigma", "status"))
-    return Run(film, in_degrees(pose - film.truth), in_degrees(sigma), status, torch.tensor(seconds))
+    return Run.of(film, Track.stack(estimates), torch.tensor(seconds))
 
 
 def soak(shot: Shot, count: int, **options: Any) -> tuple[Run, float]:
     """The Tracker on ``count`` frames of a stream, and by how many MB its peak memory grew after the first tenth."""
     start, settled = sense(shot.clean[:1], shot.seed)[0], 0.0
     tracker = Tracker(start, shot.path[:1, :2], shot.size, **options)
-    pose, sigma, truth = torch.zeros(3, count, 3, dtype=torch.float64)
-    status, (seen, seconds) = torch.zeros(count, dtype=torch.int8), torch.zeros(2, count)
+    truth, (seen, seconds) = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(2, count)
+    told: list[Tensor] = []
     for k, (frame, truth[k], seen[k]) in enumerate(stream(shot, count)):
         begun = time.perf_counter()
         estimate = tracker(frame)
         seconds[k] = time.perf_counter() - begun
-        pose[k], sigma[k], status[k] = estimate.pose[0], estimate.sigma[0], estimate.status[0]
+        if k == 0:  # all memory of its own is taken before it is measured
+            told = [torch.zeros(count, *value.shape, dtype=value.dtype) for value in estimate]
+        for values, value in zip(told, estimate, strict=True):
+            values[k] = value
         settled = peak_mb() if k == count // 10 else settled
-    error, sigma = in_degrees(pose - truth), in_degrees(sigma)
-    film = soak_film(shot, truth, seen)
-    return Run(film, error[:, None], sigma[:, None], status[:, None], seconds), peak_mb() - settled
+    return Run.of(soak_film(shot, truth, seen), Track(*told), seconds), peak_mb() - settled
 
 
 def follow_peer(film: Film, start: Start) -> Run:
@@ -101,9 +109,9 @@ def follow_peer(film: Film, start: Start) -> Run:
         last = found or last
         poses.append(last)
         status.append(Status.CONVERGED if found else Status.LOST)
-    error = in_degrees(torch.tensor(poses, dtype=torch.float64) - film.truth[:, 0])
-    none = torch.full_like(error, math.nan)
-    return Run(film, error[:, None], none[:, None], torch.tensor(status)[:, None], torch.tensor(seconds))
+    error = in_degrees(torch.tensor(poses, dtype=torch.float64)[:, None] - film.truth)
+    none, nothing = torch.full_like(error, math.nan), torch.zeros_like(error[..., 0])
+    return Run(film, error, none, torch.tensor(status)[:, None], nothing, nothing.to(torch.int8), torch.tensor(seconds))
 
 
 def recovery(run: Run) -> float:
@@ -124,6 +132,23 @@ def root_mean_square(ratio: Tensor) -> float:
     """Of each component (n, 3), the worst; NaN of none."""
     ratio = ratio[ratio.isfinite().all(1)]
     return float(ratio.square().mean(0).sqrt().max()) if len(ratio) else math.nan
+
+
+def worst(runs: Sequence[Run], count: int) -> list[tuple[str, ...]]:
+    """The ``count`` frames that are wrong and believed by most sigma, where they are and what was told of them."""
+    found = []
+    for number, run in enumerate(runs):
+        for k, r in (run.wrong & run.believed).nonzero().tolist():
+            error, sigma = run.error[k, r].tolist(), run.sigma[k, r].tolist()
+            most = max(abs(e) / s for e, s in zip(error, sigma, strict=True)) if min(sigma) > 0 else math.inf
+            told = f"{float(run.score[k, r]):.3f}", Origin(int(run.origin[k, r])).name
+            place = f"film {number}, frame {k + 1}, patch {r}", f"{float(run.film.seen[k, r]):.2f}"
+            found.append((most, (*place, _triple(error), _triple(sigma), *told)))
+    return [cells for _, cells in sorted(found, reverse=True)[:count]]
+
+
+def _triple(values: Sequence[float]) -> str:
+    return " ".join(f"{value:.4f}" for value in values)
 
 
 def after(runs: Sequence[Run]) -> int:

@@ -33,7 +33,7 @@ import click
 import torch
 from films import cameras, covers, disturbed, repeats, weak
 from films.shot import SCENES, Film, Shot
-from honesty import BY, Run, figures, follow, follow_peer, numbers, soak
+from honesty import BY, Run, figures, follow, follow_peer, numbers, soak, worst
 from results import save
 from rich.console import Console
 from rich.table import Table
@@ -149,6 +149,16 @@ def show(found: dict[str, dict[str, float]]) -> None:
     console.print(table)
 
 
+def show_worst(runs: Runs, count: int) -> None:
+    """The worst frames of every row that are wrong and believed."""
+    header = ("row", "where", "seen", "error px px deg", "sigma", "score", "origin")
+    table = Table(*header, box=None, pad_edge=False)
+    for title, some in runs.items():
+        for cells in worst(some, count):
+            table.add_row(title, *cells)
+    console.print(table)
+
+
 def soaked(count: int, by: Iterable[str]) -> tuple[Runs, list[Number]]:
     """The run over ``count`` frames without end, and how memory grew."""
     runs: Runs = {}
@@ -169,6 +179,7 @@ def soaked(count: int, by: Iterable[str]) -> tuple[Runs, list[Number]]:
 @click.option("--by", multiple=True, default=("default",), type=click.Choice([*BY, "opencv"]), show_default=True)
 @click.option("--quick", is_flag=True, help="waves and pads only, and a tenth of the arrays")
 @click.option("--soak", "soak_frames", default=2000, show_default=True, help="frames of the soak")
+@click.option("--worst", "listed", default=0, show_default=True, help="frames of each row to tell all of")
 @click.option("--data", type=click.Path(path_type=Path), default=os.environ.get("TORCH_ECC_DATA"))
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
 def main(
@@ -177,6 +188,7 @@ def main(
     by: tuple[str, ...],
     quick: bool,
     soak_frames: int,
+    listed: int,
     data: Path | None,
     out: Path | None,
 ) -> None:
@@ -197,8 +209,11 @@ def main(
         for film in films() if name in wanted else ():
             followed(runs, name, film, by)
     more, growth = soaked(soak_frames, by) if "soak" in wanted else ({}, [])
-    found = {title: figures(some) for title, some in (runs | more).items()}
+    runs |= more
+    found = {title: figures(some) for title, some in runs.items()}
     show(found)
+    if listed:
+        show_worst(runs, listed)
     if out is not None:
         save(out, [n for title, row in found.items() for n in numbers(title, row)] + growth)
 
