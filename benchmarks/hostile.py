@@ -25,8 +25,9 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import click
@@ -36,6 +37,7 @@ from films.shot import SCENES, Film, Shot
 from honesty import BY, Run, figures, follow, follow_peer, numbers, soak, worst
 from results import save
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 from rivals import rivals
 
@@ -60,6 +62,9 @@ def disturbances() -> dict[str, Row]:
             for motion in covers.MOTIONS:
                 strip = partial(covers.cover, share=share, kind=kind, motion=motion)
                 rows[f"cover {100 * share:.0f} % {kind} {motion}"] = strip
+    rows |= {f"shadow {100 * s:.0f} %": partial(covers.shadow, share=s) for s in (0.2, 0.5)}
+    rows |= {f"drops {100 * s:.0f} %": partial(covers.drops, share=s) for s in (0.05, 0.1, 0.2)}
+    rows |= {f"stuck {100 * s:.0f} %": partial(covers.stuck, share=s) for s in (0.05, 0.1, 0.2)}
     return rows | pictures() | sensors()
 
 
@@ -126,6 +131,21 @@ def shots(scenes: int, families: Iterable[str]) -> Iterator[Shot]:
     for seed in range(scenes):
         for family in families:
             yield Shot(SCENES[family](seed), seed)
+
+
+def filmed(rows: dict[str, Row], wanted: Container[str], shots: Iterable[Shot]) -> Iterator[tuple[str, Film]]:
+    """All films of the ``wanted`` rows, a scene after the other, so that each is rendered once."""
+    for shot in shots:
+        for name, disturb in rows.items():
+            if name in wanted:
+                yield name, disturb(shot)
+
+
+def made(own: dict[str, Callable[[], Iterable[Film]]], wanted: Container[str]) -> Iterator[tuple[str, Film]]:
+    """The same of the worlds."""
+    for name, films in own.items():
+        for film in films() if name in wanted else ():
+            yield name, film
 
 
 def followed(runs: Runs, name: str, film: Film, by: Iterable[str]) -> None:
@@ -200,14 +220,11 @@ def main(
         raise click.UsageError(
             f"no row has {' or '.join(words)} in its name; known are {', '.join((*rows, *own, 'soak'))}"
         )
+    families = list(SCENES)[:2] if quick else list(SCENES)
     runs: Runs = {}
-    for shot in shots(scenes, list(SCENES)[:2] if quick else SCENES) if wanted & rows.keys() else ():
-        for name, disturb in rows.items():
-            if name in wanted:
-                followed(runs, name, disturb(shot), by)
-    for name, films in own.items():
-        for film in films() if name in wanted else ():
-            followed(runs, name, film, by)
+    films = chain(filmed(rows, wanted, shots(scenes, families)), made(own, wanted))
+    for name, film in track(films, "films", console=Console(stderr=True), transient=True):
+        followed(runs, name, film, by)
     more, growth = soaked(soak_frames, by) if "soak" in wanted else ({}, [])
     runs |= more
     found = {title: figures(some) for title, some in runs.items()}
