@@ -100,6 +100,8 @@ def sensors() -> dict[str, Row]:
         "fixed aperture": cameras.aperture,
         "fixed stripe": cameras.stripe,
         "fixed dust": cameras.dust,
+        "fixed stripe, faint": partial(cameras.stripe, opacity=0.3),
+        "fixed dust, faint": partial(cameras.dust, opacity=0.3),
         "fixed pattern": cameras.fixed_pattern,
         "noise in rows": partial(cameras.lined, across=False),
         "noise in columns": partial(cameras.lined, across=True),

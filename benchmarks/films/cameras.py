@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from films.disturbed import jpeg
-from films.shot import Film, Shot, each, sense
+from films.shot import NOISE, Film, Shot, each, sense
 from torch_ecc.paper.bound import rounding
 from torch_ecc.sim import PlaneWaves
 from torch_ecc.sim.camera import optics, sensor
@@ -35,31 +35,33 @@ def aperture(shot: Shot) -> Film:
     return shut(shot, (torch.hypot(*around(shot)) - 0.58 * shot.size).clamp(0, 1))
 
 
-def stripe(shot: Shot) -> Film:
+def stripe(shot: Shot, opacity: float = 1.0) -> Film:
     """A dark stripe of 8 px, slanted by 10 deg."""
     x, y = around(shot)
-    return shut(shot, (4.5 - (x + math.tan(math.radians(10)) * y - 12).abs()).clamp(0, 1))
+    return shut(shot, opacity * (4.5 - (x + math.tan(math.radians(10)) * y - 12).abs()).clamp(0, 1))
 
 
-def dust(shot: Shot, grains: int = 10) -> Film:
+def dust(shot: Shot, opacity: float = 1.0, grains: int = 10) -> Film:
     """Dark grains of 2 to 5 px on the sensor."""
     x, y = around(shot)
     u = torch.rand(grains, 3, generator=torch.Generator().manual_seed(shot.seed)) - 0.5
     off = [3.5 + 3 * r - torch.hypot(x - shot.size * a, y - shot.size * b) for a, b, r in u.tolist()]
-    return shut(shot, torch.stack(off).amax(0).clamp(0, 1))
+    return shut(shot, opacity * torch.stack(off).amax(0).clamp(0, 1))
 
 
 def fixed_pattern(shot: Shot, sigma: float = 4.0) -> Film:
     """An offset of its own for every pixel, the same in all frames."""
     pattern = sigma * torch.randn(shot.frame, generator=torch.Generator().manual_seed(shot.seed))
-    return shot.film(shot.clean + pattern)
+    frames = sense(shot.clean + pattern, shot.seed)
+    return shot.sensed(frames, None, NOISE**2 + sigma**2 + rounding(8))
 
 
 def lined(shot: Shot, across: bool) -> Film:
     """Beside white noise an offset of 2 grey levels for every row, or column where ``across``, drawn in every frame."""
     h, w = shot.frame
     lines = partial(sensor.read, torch.zeros(1, 1, w) if across else torch.zeros(1, h, 1), 2.0)
-    return shot.film(shot.clean + each(shot.clean, shot.seed + 1, lambda one, source: lines(source)))
+    image = shot.clean + each(shot.clean, shot.seed + 1, lambda one, source: lines(source))
+    return shot.sensed(sense(image, shot.seed))
 
 
 def soft(shot: Shot, sigma: float = 1.0) -> Film:
@@ -68,7 +70,7 @@ def soft(shot: Shot, sigma: float = 1.0) -> Film:
     white = torch.zeros(len(shot.clean), 1, *(n + 2 * reach for n in shot.frame))
     noise = optics.focus(each(white, shot.seed + 1, partial(sensor.read, sigma=2.0)), sigma, 0.0)
     noise *= 2.0 / noise.std()
-    return shot.film(shot.clean + noise, noise=0.0)._replace(bound=torch.full((len(noise) - 1, 1, 3), math.nan))
+    return shot.sensed(sensor.quantise(shot.clean + noise, 8))
 
 
 def noisy_jpeg(shot: Shot, quality: int) -> Film:
