@@ -15,6 +15,17 @@ SETTLED = 1e-6  # px: the last step of an oracle that has its answer
 STEPS = 30  # at most; it takes two or three from nearby
 
 
+def jacobian(scene: Scene, size: tuple[int, int], at: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The template (N,) at the scene's origin, or ``at`` (3,) in it, and its Jacobian (N, 3) by x, y, theta."""
+    h, w = size
+    y, x = torch.meshgrid(torch.arange(h) - (h - 1) / 2, torch.arange(w) - (w - 1) / 2, indexing="ij")
+    points = torch.stack((x.flatten(), y.flatten()), -1).double()
+    place = points.new_zeros(3) if at is None else at
+    there = transform(place, points)
+    gx, gy = (scene.gradient(there) @ rotation(place[2])).unbind(-1)
+    return scene.value(there), torch.stack((gx, gy, gx * points[:, 1] - gy * points[:, 0]), -1)
+
+
 def cramer_rao(scene: Scene, size: tuple[int, int], variance: float, at: Tensor | None = None) -> Tensor:
     """Bound (3,) px, px, rad on the standard deviation of x, y, theta of a template (h, w) at the scene's origin.
 
@@ -24,13 +35,7 @@ def cramer_rao(scene: Scene, size: tuple[int, int], variance: float, at: Tensor 
     drawn anew each time. Gain and offset are unknown, so the Jacobian counts only off {1, t}:
     cov >= variance (J_p^T J_p)^-1.
     """
-    h, w = size
-    y, x = torch.meshgrid(torch.arange(h) - (h - 1) / 2, torch.arange(w) - (w - 1) / 2, indexing="ij")
-    points = torch.stack((x.flatten(), y.flatten()), -1).double()
-    place = points.new_zeros(3) if at is None else at
-    there = transform(place, points)
-    t, (gx, gy) = scene.value(there), (scene.gradient(there) @ rotation(place[2])).unbind(-1)
-    J = torch.stack((gx, gy, gx * points[:, 1] - gy * points[:, 0]), -1)
+    t, J = jacobian(scene, size, at)
     span, _ = torch.linalg.qr(torch.stack((torch.ones_like(t), t), -1))
     J = J - span @ (span.mT @ J)
     covariance: Tensor = variance * torch.linalg.inv(J.mT @ J)
