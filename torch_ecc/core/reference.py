@@ -99,7 +99,7 @@ class Noise(NamedTuple):
 class Blocks(NamedTuple):
     """Of the blocks of B templates, (B, blocks) each: their weights' ``count``, the weighted sum of ``t`` less its mean
     and of its ``square``, the mean square of their slopes' texture, ``slope``; and which of those that hold pixels
-    enough are ``flat``, as half of them are, or ``steep``, as is the other half."""
+    enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``: either."""
 
     count: Tensor
     t: Tensor
@@ -107,6 +107,7 @@ class Blocks(NamedTuple):
     slope: Tensor
     flat: Tensor
     steep: Tensor
+    enough: Tensor
 
 
 class _Groups(NamedTuple):
@@ -300,7 +301,7 @@ def _blocks(reference: Reference) -> Blocks:
     slope = slope / count.clamp(min=1e-30)
     enough = count > HALF_FULL * count.amax(1, keepdim=True)
     middle = torch.where(enough, slope, torch.nan).nanmedian(1, keepdim=True).values
-    return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle))
+    return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle), enough)
 
 
 def _columns(local: Tensor, images: tuple[Tensor, Tensor], wiener: Tensor, weight: Tensor) -> Columns:

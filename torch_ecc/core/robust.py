@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torch_ecc.core.normal import LEAST
+from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.reference import BLOCK, Blocks, Reference, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
@@ -28,7 +28,7 @@ QUANTILE, TO_MEDIAN = 0.3, 1.13  # of the blocks' variances: a scale that covers
 LEAST_SLIP, SLIP = 0.00125, 0.045  # px^2 / 2: blocks may seem to have slipped by 0.05 px rms, as of the sampler,
 FIRST_SLIP = 1.0  # to 0.3 px, as of blur; before the solve by more
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
-NOISIER = 1.5  # times the usual residual variance: more is no noise where blocks do not fit alike
+NOISIER = 1.0  # times the usual residual variance: more is no noise where blocks do not fit alike
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS = 5
 BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
@@ -53,6 +53,29 @@ class Scale(NamedTuple):
     slip: Tensor
 
 
+class Doubted(NamedTuple):
+    """Templates at ``index`` (n,) of a solve that are solved again: what they have in each block, the ``floor`` (n, 1)
+    of the noise's variance and their ``usual`` (n,) score."""
+
+    engine: Engine
+    reference: Reference
+    image: Tensor
+    settings: Settings
+    index: Tensor
+    blocks: Blocks
+    floor: Tensor
+    usual: Tensor
+
+    def at(self, part: Tensor) -> Doubted:
+        """Some of them."""
+        blocks = each(lambda value: value[part], self.blocks)
+        return self._replace(index=self.index[part], blocks=blocks, floor=self.floor[part], usual=self.usual[part])
+
+    def solve(self, start: Tensor, settings: Settings, trusted: Tensor) -> Solution:
+        """From ``start`` (B, 3) on, with blocks (n, blocks) as they are trusted."""
+        return self.engine.solve(self.reference, self.image, start, settings, Trust(self.index, trusted))
+
+
 def solve(
     engine: Engine, reference: Reference, image: Tensor, start: Tensor, settings: Settings, usual: Tensor | None = None
 ) -> Solution:
@@ -60,67 +83,98 @@ def solve(
     found = engine.solve(reference, image, start, settings)
     if not settings.robust:
         return found
-    usual = expected_score(reference) if usual is None else usual
-    blocks, seen, floor = reference.blocks, found.sums[:, 0], least_noise(reference)
-    variance = residual_variance(found.sums)
-    scale = robust_scale(variance, blocks, seen, floor, Scale(floor + inf, torch.full_like(floor, SLIP)))
-    uneven = (excess(variance, blocks, seen, scale) > OUTLIER).any(1)
-    doubtful = uneven | ~within_margin(correlation(found.normal, found.total), usual)
-    index = torch.arange(len(start), device=start.device)
-    if is_cpu(start.device):  # nowhere else does the host ask
-        index = doubtful.nonzero()[:, 0]
-        if len(index) == 0:
+    usual, on_cpu = expected_score(reference) if usual is None else usual, is_cpu(start.device)
+    odd = unusual(reference, found, usual)
+    if on_cpu and not odd.any():
+        return found
+    index = odd.nonzero()[:, 0] if on_cpu else torch.arange(len(start), device=start.device)  # no look of the host there
+    blocks = each(lambda value: value[index], reference.blocks)
+    doubted = Doubted(
+        engine, reference, image, settings, index, blocks, least_noise(reference)[index], usual[index]
+    )
+    plain = each(lambda value: value[index], found)
+    uneven = has_outliers(doubted, plain)
+    doubtful = uneven | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
+    if on_cpu and not doubtful.all():
+        if not doubtful.any():
             return found
-    again = reweighted(engine, reference, image, start, settings, usual, index)
-    # Far from the answer nothing fits: perhaps least squares has come nearer, unless it has slid away from the cover.
-    way = ((found.pose - start) * reference.place.lever)[index]
-    far = (coverage(again) < LEAST_COVERAGE) & (torch.linalg.vector_norm(way, dim=1) < BASIN)
-    if not is_cpu(start.device) or bool(far.any()):
-        there = reweighted(engine, reference, image, found.pose, settings, usual, index)
-        again = each(lambda old, new: _put(old, torch.arange(len(index), device=index.device), new, far), again, there)
-    # Noise may have grown in all of the patch: then least squares is right, and only the scale is not.
-    better = doubtful[index] & (uneven[index] | (coverage(again) > LEAST_COVERAGE))
-    found = found._replace(trust=torch.ones_like(variance))
-    return each(lambda old, new: _put(old, index, new, better), found, again)
+        doubted, plain, uneven, doubtful = (
+            doubted.at(doubtful),
+            each(lambda value: value[doubtful], plain),
+            uneven[doubtful],
+            doubtful[doubtful],
+        )
+    again = solved_again(doubted, start, found.pose)
+    # Noise may have grown in all of the patch: then least squares is right, and only its scale is not.
+    better = doubtful & (uneven | (coverage(again) > LEAST_COVERAGE))
+    plain = plain._replace(trust=torch.ones_like(plain.sums[:, 0]))
+    chosen = each(lambda old, new: _where(better, new, old), plain, again)
+    found = found._replace(trust=torch.ones_like(found.sums[:, 0]))
+    return each(lambda old, new: old.index_copy(0, doubted.index, new), found, chosen)
 
 
-def _put(old: Tensor, index: Tensor, new: Tensor, better: Tensor) -> Tensor:
-    """``old`` (B, ...) with what is ``better`` (n,) of the ``new`` (n, ...) at ``index`` (n,)."""
-    chosen = torch.where(better.view(-1, *[1] * (new.dim() - 1)), new, old[index])
-    return old.index_copy(0, index, chosen)
+def unusual(reference: Reference, found: Solution, usual: Tensor) -> Tensor:
+    """Which templates (B,) have blocks with residuals that would be too much even for noise as it is ``usual`` (B,):
+    others need no scale of this frame's own."""
+    most = usual_variance(found.normal, found.gain, usual) * OUTLIER
+    return ~((residual_variance(found.sums) * reference.blocks.enough).amax(1) <= most)  # NaN is unusual
 
 
-def reweighted(
-    engine: Engine,
-    reference: Reference,
-    image: Tensor,
-    start: Tensor,
-    settings: Settings,
-    usual: Tensor,
-    index: Tensor,
-) -> Solution:
-    """The templates at ``index`` (n,) solved from their ``start`` (B, 3) with trust that has settled."""
-    blocks, floor = each(lambda value: value[index], reference.blocks), least_noise(reference)[index]
-    whole = Trust(index, torch.ones_like(blocks.count))
-    look = engine.solve(reference, image, start, settings.once, whole)
+def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
+    """Which templates (n,) have blocks that fit far worse than others."""
+    most = Scale(doubted.floor + inf, torch.full_like(doubted.floor, SLIP))
+    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
+    return ~(ratio <= OUTLIER).all(1)
+
+
+def solved_again(doubted: Doubted, start: Tensor, there: Tensor) -> Solution:
+    """From ``start`` (B, 3); if half of the template is not believed then, perhaps because all of it is off, from
+    ``there`` (B, 3), where least squares has come to, unless it has slid away with what covers the template."""
+    again = reweighted(doubted, start)
+    way = ((there - start) * doubted.reference.place.lever)[doubted.index]
+    off = (coverage(again) < LEAST_COVERAGE) & (torch.linalg.vector_norm(way, dim=1) < BASIN)
+    if is_cpu(start.device) and not off.any():
+        return again
+    return each(lambda old, new: _where(off, new, old), again, reweighted(doubted, there))
+
+
+def reweighted(doubted: Doubted, place: Tensor) -> Solution:
+    """Solved from their ``place`` (B, 3) on, with trust that has settled."""
+    blocks, floor = doubted.blocks, doubted.floor
+    look = doubted.solve(place, doubted.settings.once, torch.ones_like(blocks.count))
     variance, gain = median_fit(look.sums, blocks)
-    normal = look.normal
-    contrast = (normal.energy / normal.total.clamp(min=LEAST))[:, None] * gain.square()
-    most = (NOISIER * (1 - usual[index, None]) * contrast).to(floor.dtype).maximum(floor)
-    scale = robust_scale(variance, blocks, look.sums[:, 0], floor, Scale(most, torch.full_like(most, FIRST_SLIP)))
-    trusted = trust(excess(variance, blocks, look.sums[:, 0], scale))
-    place = start
+    noise = NOISIER * usual_variance(look.normal, gain[:, 0], doubted.usual)
+    most = Scale(noise.to(floor.dtype).unsqueeze(1).maximum(floor), torch.full_like(floor, FIRST_SLIP))
+    scale, ratio = compared(doubted, variance, look.sums[:, 0], most)
+    after = trust(ratio)
     for _ in range(ROUNDS):
-        found = engine.solve(reference, image, place, settings, Trust(index, trusted))
-        variance = residual_variance(found.sums)
+        before = after
+        found = doubted.solve(place, doubted.settings, before)
         most = Scale(scale.noise, scale.slip.clamp(max=SLIP))  # no cover may talk itself in
-        scale = robust_scale(variance, blocks, found.sums[:, 0], floor, most)
-        before, trusted = trusted, trust(excess(variance, blocks, found.sums[:, 0], scale))
-        change = ((trusted - before).abs() * blocks.count).sum(1)
-        if is_cpu(start.device) and bool((change <= SETTLED * blocks.count.sum(1)).all()):
+        scale, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
+        after = trust(ratio)
+        change = ((after - before).abs() * blocks.count).sum(1)
+        if is_cpu(place.device) and bool((change <= SETTLED * blocks.count.sum(1)).all()):
             break
-        place = start.index_copy(0, index, found.pose)
+        place = place.index_copy(0, doubted.index, found.pose)
     return found._replace(trust=before)
+
+
+def compared(doubted: Doubted, variance: Tensor, seen: Tensor, most: Scale) -> tuple[Scale, Tensor]:
+    """The scale, at ``most`` so large, and the ``variance`` (n, blocks) of blocks over what it lets expect."""
+    scale = robust_scale(variance, doubted.blocks, seen, doubted.floor, most)
+    return scale, excess(variance, doubted.blocks, seen, scale)
+
+
+def usual_variance(normal: Normal, gain: Tensor, usual: Tensor) -> Tensor:
+    """The residual variance (B,) of templates seen with a ``gain`` (B,) whose score s is the ``usual`` (B,) one: the
+    share 1 - s^2 of their own."""
+    return (1 - usual * usual) * gain.square() * normal.energy / normal.total.clamp(min=LEAST)
+
+
+def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Of values (n, ...) those ``chosen`` (n,)."""
+    return torch.where(chosen.view(-1, *[1] * (new.dim() - 1)), new, old)
 
 
 def trust(ratio: Tensor) -> Tensor:
