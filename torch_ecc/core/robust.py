@@ -19,7 +19,7 @@ from torch_ecc.core.reference import BLOCK, Blocks, Reference, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution, Trust
-from torch_ecc.core.verdict import LEAST_COVERAGE, correlation, coverage, expected_score, within_margin
+from torch_ecc.core.verdict import correlation, expected_score, within_margin
 
 OUTLIER = 3.0  # times the variance that is expected of a block: beyond it less and less is believed
 DISTRUST = 3.0  # trust = (OUTLIER / ratio)^this
@@ -28,9 +28,9 @@ QUANTILE, TO_MEDIAN = 0.3, 1.13  # of the blocks' variances: a scale that covers
 LEAST_SLIP, SLIP = 0.00125, 0.045  # px^2 / 2: blocks may seem to have slipped by 0.05 px rms, as of the sampler,
 FIRST_SLIP = 1.0  # to 0.3 px, as of blur; before the solve by more
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
-NOISIER = 1.0  # times the usual residual variance: more is no noise where blocks do not fit alike
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS = 5
+FITS = 1.6  # as ``cost`` counts: well believed by more than half, and nothing else is tried
 BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
 SETTLED = 0.01  # of the template's weight: trust changes no more
 
@@ -71,6 +71,10 @@ class Doubted(NamedTuple):
         blocks = each(lambda value: value[part], self.blocks)
         return self._replace(index=self.index[part], blocks=blocks, floor=self.floor[part], usual=self.usual[part])
 
+    def any_scale(self, slip: float) -> Scale:
+        """No limit to the noise."""
+        return Scale(self.floor + inf, torch.full_like(self.floor, slip))
+
     def solve(self, start: Tensor, settings: Settings, trusted: Tensor) -> Solution:
         """From ``start`` (B, 3) on, with blocks (n, blocks) as they are trusted."""
         return self.engine.solve(self.reference, self.image, start, settings, Trust(self.index, trusted))
@@ -93,22 +97,14 @@ def solve(
         engine, reference, image, settings, index, blocks, least_noise(reference)[index], usual[index]
     )
     plain = each(lambda value: value[index], found)
-    uneven = has_outliers(doubted, plain)
-    doubtful = uneven | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
+    doubtful = has_outliers(doubted, plain) | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
     if on_cpu and not doubtful.all():
         if not doubtful.any():
             return found
-        doubted, plain, uneven, doubtful = (
-            doubted.at(doubtful),
-            each(lambda value: value[doubtful], plain),
-            uneven[doubtful],
-            doubtful[doubtful],
-        )
-    again = solved_again(doubted, start, found.pose)
-    # Noise may have grown in all of the patch: then least squares is right, and only its scale is not.
-    better = doubtful & (uneven | (coverage(again) > LEAST_COVERAGE))
+        doubted, plain, doubtful = doubted.at(doubtful), each(lambda value: value[doubtful], plain), doubtful[doubtful]
+    again = solved_again(doubted, start, plain)
     plain = plain._replace(trust=torch.ones_like(plain.sums[:, 0]))
-    chosen = each(lambda old, new: _where(better, new, old), plain, again)
+    chosen = each(lambda old, new: _where(doubtful, new, old), plain, again)
     found = found._replace(trust=torch.ones_like(found.sums[:, 0]))
     return each(lambda old, new: old.index_copy(0, doubted.index, new), found, chosen)
 
@@ -122,30 +118,49 @@ def unusual(reference: Reference, found: Solution, usual: Tensor) -> Tensor:
 
 def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
     """Which templates (n,) have blocks that fit far worse than others."""
-    most = Scale(doubted.floor + inf, torch.full_like(doubted.floor, SLIP))
-    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
+    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], doubted.any_scale(SLIP))
     return ~(ratio <= OUTLIER).all(1)
 
 
-def solved_again(doubted: Doubted, start: Tensor, there: Tensor) -> Solution:
-    """From ``start`` (B, 3); if half of the template is not believed then, perhaps because all of it is off, from
-    ``there`` (B, 3), where least squares has come to, unless it has slid away with what covers the template."""
-    again = reweighted(doubted, start)
+def solved_again(doubted: Doubted, start: Tensor, plain: Solution) -> Solution:
+    """The best of what trust leads to that begins with the residuals of least squares, or with those under a median
+    fit, at the ``start`` (B, 3) and where least squares has come to, unless it has slid away with the cover."""
+    there = start.index_copy(0, doubted.index, plain.pose)
     way = ((there - start) * doubted.reference.place.lever)[doubted.index]
-    off = (coverage(again) < LEAST_COVERAGE) & (torch.linalg.vector_norm(way, dim=1) < BASIN)
-    if is_cpu(start.device) and not off.any():
-        return again
-    return each(lambda old, new: _where(off, new, old), again, reweighted(doubted, there))
+    slid = ~(torch.linalg.vector_norm(way, dim=1) < BASIN)
+    variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
+    first = compared(doubted, variance, seen, usual_scale(doubted, plain, plain.gain.unsqueeze(1), SLIP))
+    best, least = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain)
+    for place, begin in ((there, first), (start, None), (there, None)):
+        found = reweighted(doubted, place, median_look(doubted, place) if begin is None else begin)
+        price = cost(doubted, found)
+        better = (price < least) & ~(slid & (place is there))
+        best, least = each(lambda old, new: _where(better, new, old), best, found), torch.where(better, price, least)
+        if is_cpu(start.device) and bool((least < FITS).all()):
+            break
+    return best
 
 
-def reweighted(doubted: Doubted, place: Tensor) -> Solution:
-    """Solved from their ``place`` (B, 3) on, with trust that has settled."""
-    blocks, floor = doubted.blocks, doubted.floor
-    look = doubted.solve(place, doubted.settings.once, torch.ones_like(blocks.count))
-    variance, gain = median_fit(look.sums, blocks)
-    noise = NOISIER * usual_variance(look.normal, gain[:, 0], doubted.usual)
-    most = Scale(noise.to(floor.dtype).unsqueeze(1).maximum(floor), torch.full_like(floor, FIRST_SLIP))
-    scale, ratio = compared(doubted, variance, look.sums[:, 0], most)
+def cost(doubted: Doubted, found: Solution) -> Tensor:
+    """What is left of templates (n,), in blocks at most OUTLIER times what is usual: the mean over their weight, 1 if
+    all is noise and OUTLIER if nothing fits (the truncated squares that re-weighting makes least)."""
+    seen = found.sums[:, 0]
+    scale = usual_scale(doubted, found, found.gain.unsqueeze(1), LEAST_SLIP)
+    ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(0, OUTLIER)
+    value = (ratio.nan_to_num(OUTLIER) * seen).sum(1) / seen.sum(1).clamp(min=LEAST)
+    return torch.where(found.gain > 0, value, OUTLIER)
+
+
+def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:
+    """Scale and excess (n, blocks) under a median fit at ``place`` (B, 3)."""
+    look = doubted.solve(place, doubted.settings.once, torch.ones_like(doubted.blocks.count))
+    variance, gain = median_fit(look.sums, doubted.blocks)
+    return compared(doubted, variance, look.sums[:, 0], usual_scale(doubted, look, gain, FIRST_SLIP))
+
+
+def reweighted(doubted: Doubted, place: Tensor, first: tuple[Scale, Tensor]) -> Solution:
+    """Solved from their ``place`` (B, 3) on, with trust that begins with the ``first`` scale and excess and settles."""
+    blocks, (scale, ratio) = doubted.blocks, first
     after = trust(ratio)
     for _ in range(ROUNDS):
         before = after
@@ -158,6 +173,12 @@ def reweighted(doubted: Doubted, place: Tensor) -> Solution:
             break
         place = place.index_copy(0, doubted.index, found.pose)
     return found._replace(trust=before)
+
+
+def usual_scale(doubted: Doubted, found: Solution, gain: Tensor, slip: float) -> Scale:
+    """The scale of templates seen with a ``gain`` (n, 1) if their noise is the usual one."""
+    noise = usual_variance(found.normal, gain[:, 0], doubted.usual).to(doubted.floor.dtype)
+    return Scale(noise.unsqueeze(1).maximum(doubted.floor), torch.full_like(doubted.floor, slip))
 
 
 def compared(doubted: Doubted, variance: Tensor, seen: Tensor, most: Scale) -> tuple[Scale, Tensor]:
