@@ -57,6 +57,5 @@ def draw(errors: dict[str, list[Tensor]], found: Staircase) -> Figure:
             draw_box(axes, x, step)
         draw_range(axes, MAIN_DEG[name])
         label_steps(axes, found.levels_deg, rotation=45)
-        axes.set(xlabel="step (deg)", ylabel="mean error (deg)")
-        letter(axes, f"({'ab'[k]}) {name}")
+        axes.set(title=letter(f"({'ab'[k]}) {name}"), xlabel="step (deg)", ylabel="mean error (deg)")
     return figure

@@ -91,10 +91,8 @@ def draw(found: Staircase, by_sensors: Deviations, by_truth: Deviations) -> Figu
     for rows, colour, words in ((time < turning, UP, "ascent"), (time >= turning, DOWN, "descent")):
         plane.plot(*track.pose[rows, :2].T, ".", ms=2, color=colour, label=words)
     plane.plot(*law[::16].T, color=LAW, lw=0.8, label=r"lever arm x $\theta$ of CDS")
-    plane.set(xlabel="x (um)", ylabel="y (um)")
-    plane.set_aspect("equal", "datalim")
+    plane.set(title=letter("(a) in the plane"), xlabel="x (um)", ylabel="y (um)", aspect="equal", adjustable="datalim")
     plane.legend(loc="upper left", markerscale=3)
-    letter(plane, "(a) in the plane")
     _draw_parts(parts, time, track.pose, (sensors.time_s, law))
     _draw_left(left, by_sensors, by_truth)
     return figure
@@ -104,9 +102,8 @@ def _draw_parts(axes: Axes, time: Tensor, pose: Tensor, law: tuple[Tensor, Tenso
     for i, colour in enumerate((UP, DOWN)):
         axes.plot(law[0], law[1][:, i], color="0.6", lw=0.6)
         axes.plot(time, pose[:, i], color=colour, lw=0.9, label=COMPONENTS[i])
-    axes.set(xlabel="time (s)", ylabel="x, y (um)")
+    axes.set(title=letter("(b) components"), xlabel="time (s)", ylabel="x, y (um)")
     axes.legend(loc="lower left")
-    letter(axes, "(b) components")
 
 
 def _draw_left(axes: Axes, by_sensors: Deviations, by_truth: Deviations) -> None:
@@ -119,6 +116,5 @@ def _draw_left(axes: Axes, by_sensors: Deviations, by_truth: Deviations) -> None
     axes.axhline(0, color="0.6", lw=0.8)
     axes.set(xlabel="step, up and down", ylabel=r"minus lever arm x $\theta$ (nm)", xticks=steps)
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
+    axes.set(title=letter("(c) deviation of the means"), ylim=(low, high + 0.2 * (high - low)))  # room for the legend
     axes.legend(fontsize=8, ncols=2, loc="upper center")
-    letter(axes, "(c) deviation of the means")

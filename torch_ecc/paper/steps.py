@@ -12,16 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.paper.acquisition import (
-    COMMAND_HZ,
-    Acquisition,
-    Bench,
-    acquire,
-    frames_of,
-    microscope,
-    simulated_once,
-    zeroed,
-)
+from torch_ecc.paper.acquisition import COMMAND_HZ, Acquisition, Bench, microscope, simulated_once, zeroed
 from torch_ecc.paper.result import Advance, Table, cells, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Dwells, Motion, dwell_errors
@@ -80,10 +71,9 @@ def staircase(quick: bool, advance: Advance) -> Staircase:
     """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
     dwell_s = 0.3 if quick else 3.0
     view, path = microscope(quick, zoom=ZOOM, view_um=VIEW_UM), command(dwell_s)
-    frames = frames_of(path, Bench(microscope=view))
+    frames = Bench(view).frames(path)
     light = Lights((GradientLight(), LampDrift(LAMP, period=2.2 * frames)))
-    bench = Bench(microscope=view, methods=METHODS, gain=GAIN, light=light)
-    acquired = acquire(path, bench, counter(frames, advance))
+    acquired = Bench(view, light, GAIN, METHODS).acquire(path, counter(frames, advance))
     angle, rest = view.axis_angle, dwell_s / 4  # the angle is known from the circles
     turn, calibration = Calibration(1.0, angle), Calibration(view.um_per_px, angle)
     sensors = zeroed(acquired.sensors, rest)
