@@ -75,7 +75,7 @@ def test_the_bound_of_a_template_that_lies_turned_is_along_its_own_axes():
 
 def test_a_scene_kept_is_the_scene_rendered():
     scene, poses = PlaneWaves.random(seed=3), torch.tensor([[30.0, 20.0, 0.2]]).double()
-    wide = scheme.Kept(scene, scene.render(poses + torch.tensor((4.0, 4.0, 0.0)), (48, 68)))
+    wide = scheme.Kept(scene.render(poses + torch.tensor((4.0, 4.0, 0.0)), (48, 68)))
     for camera in (Camera(size=(40, 60)), Camera(size=(40, 60), blur_sigma=1.0)):
         assert torch.equal(camera.capture(wide, poses), camera.capture(scene, poses))
     draws = Camera(size=(40, 60), noise_sigma=5.0).capture(wide, poses.expand(2, 3))

@@ -61,7 +61,7 @@ def sequence_errors(path: Tensor, tick: Callable[[], None]) -> Errors:
     followers: dict[str, dict[str, Follower]] = {}
     found: dict[str, dict[str, list[Tensor]]] = {c: {m: [] for m in METHODS} for c in views}
     for pose in path.split(1):
-        clean = scheme.Kept(scene, scene.render(pose, scheme.FRAME))
+        clean = scheme.Kept(scene.render(pose, scheme.FRAME))
         for name, camera in views.items():
             frame = camera.capture(clean, pose)
             if name not in followers:

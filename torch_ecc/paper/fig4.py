@@ -100,14 +100,14 @@ def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None
     """
     scene, truth = scheme.scene(), cut.truth(path)
     noisy = bool((cut.pose == path[0]).all())
-    still = scheme.Kept(scene, scene.render(cut.pose[None], scheme.FRAME))
+    still = scheme.Kept(scene.render(cut.pose[None], scheme.FRAME))
     many = torch.zeros(DRAWS, dtype=torch.long)
     bound = in_degrees(cramer_rao(scene, (scheme.SIZE, scheme.SIZE), 2.0 if noisy else 1.0, cut.place()))
     cameras = {v: Camera(size=scheme.FRAME, noise_sigma=noise_sigma(v)) for v in VARIANCES}
     found: dict[float, dict[str, list[Tensor]]] = {v: {m: [] for m in COMPARED} for v in VARIANCES}
     followers: dict[str, Follower] = {}
     for k in poses.tolist():
-        clean = scheme.Kept(scene, scene.render(path[k : k + 1], scheme.FRAME))
+        clean = scheme.Kept(scene.render(path[k : k + 1], scheme.FRAME))
         for number, (v, camera) in enumerate(cameras.items()):
             frames = camera.capture(clean, path[k + many], seed=SEED + number, first=k * DRAWS)
             if noisy or not followers:

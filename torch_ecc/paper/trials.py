@@ -73,7 +73,7 @@ def pairs(count: int, jump: float, turn: float) -> tuple[Cut, Tensor]:
 def _rendered(count: int, jump: float, turn: float) -> Kept:
     """The second frames without what the camera does to them, and with a border."""
     second = pairs(count, jump, turn)[1] + torch.tensor((BORDER, BORDER, 0.0), dtype=torch.float64)
-    return Kept(scene(), scene().render(second, (FRAME[0] + 2 * BORDER, FRAME[1] + 2 * BORDER)))
+    return Kept(scene().render(second, (FRAME[0] + 2 * BORDER, FRAME[1] + 2 * BORDER)))
 
 
 class Tracked:

@@ -48,9 +48,14 @@ class Alignment(NamedTuple):
     miss: Tensor
 
     @property
+    def results(self) -> list[Result]:
+        """Of the servo steps that were begun: the substrate's, the probe's."""
+        return [result for result in (self.substrate, self.probe) if result is not None]
+
+    @property
     def ending(self) -> Ending:
-        """How the last step that was begun ended."""
-        return self.substrate.ending if self.probe is None else self.probe.ending
+        """How the last of them ended."""
+        return self.results[-1].ending
 
     @property
     def aligned(self) -> bool:
