@@ -35,7 +35,8 @@ def run(quick: bool, advance: Advance) -> Experiment:
     paths = {motion: motion.path() - torch.tensor((*scheme.CENTRE, 0.0)) for motion in LINES}
     advance(1, 2)
     error = float((parts.reflected * parts.incident - original).abs().max()) / 255
-    rough = roughness(parts.incident)
+    slope = max(parts.incident.diff(dim=k).abs().max() for k in (-1, -2))
+    rough = float(slope / parts.incident.mean())
     records = [
         Number("fig2 reflected x incident minus original, largest", error, "of full scale", tolerance=1e-5),
         Number("fig2 largest slope of the incident component", rough, "of its mean per px", tolerance=0.01),
@@ -60,12 +61,6 @@ def _fastest(path: Tensor) -> tuple[float, float]:
     """Largest motion from frame to frame, px and deg."""
     step = path.diff(dim=0)
     return float(step[:, :2].norm(dim=1).max()), math.degrees(float(step[:, 2].abs().max()))
-
-
-def roughness(incident: Tensor) -> float:
-    """Largest slope of a light (1, 1, h, w) between neighbouring pixels over its mean."""
-    slopes = (incident.diff(dim=-1).abs().max(), incident.diff(dim=-2).abs().max())
-    return float(max(slopes) / incident.mean())
 
 
 def draw(original: Tensor, parts: Retinex, paths: Mapping[scheme.Harmonic, Tensor]) -> Figure:
