@@ -13,7 +13,7 @@ from torch_ecc.paper import parasitic
 from torch_ecc.paper.errors import rms
 from torch_ecc.paper.parasitic import Deviations
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
-from torch_ecc.paper.steps import VIEW_UM, Staircase, staircase
+from torch_ecc.paper.steps import HIGHEST, VIEW_UM, Staircase, staircase
 from torch_ecc.plots.style import COMPONENTS, letter, new_figure
 
 UP, DOWN, LAW = "#0072b2", "#d55e00", "#1b1b1b"
@@ -85,8 +85,7 @@ def draw(found: Staircase, by_sensors: Deviations, by_truth: Deviations) -> Figu
     plane, parts, left = figure.subplots(1, 3, width_ratios=(1, 1.35, 1.35))
     track, sensors = found.tracks["ECC"], found.sensors
     time = track.time_s + found.alignment.offset_s
-    top = int(found.levels_deg.argmax())
-    turning = float(found.windows_s[top].mean())
+    turning = float(found.windows_s[HIGHEST].mean())
     law = parasitic.predicted(sensors.pose)
     for rows, colour, words in ((time < turning, UP, "ascent"), (time >= turning, DOWN, "descent")):
         plane.plot(*track.pose[rows, :2].T, ".", ms=2, color=colour, label=words)

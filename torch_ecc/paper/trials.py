@@ -79,7 +79,8 @@ def _rendered(count: int, jump: float, turn: float) -> Kept:
 class Tracked:
     """Trackers with ``options`` of templates in the middle of first frames (B, 1, H, W), made anew for every frame.
 
-    ``status`` (B,): that of the last one."""
+    ``status`` (B,): that of the last one.
+    """
 
     status: Tensor
 
