@@ -33,7 +33,7 @@ class Aligned:
     def track(self, frame: Tensor) -> Tensor:
         """Poses (R, 3) in the next frame."""
         settings: dict[str, Any] = {"interpolation": self.interpolation, "max_iterations": PAPER_ITERATIONS}
-        found = align(self.reference, frame, self.pose, **settings)
+        found = align(self.reference, frame, self.pose, robust=False, **settings)  # as ref. 34: plain least squares
         self.pose, self.iterations, self.status = found.pose, found.iterations, found.status
         return self.pose
 
