@@ -157,7 +157,7 @@ def followed(runs: Runs, name: str, film: Film, by: Iterable[str]) -> None:
             continue
         run = follow_peer(film, rivals()[PEER].start) if how == "opencv" else follow(film, **BY[how])
         title = name if how == "default" else f"{name}, {how}"
-        runs.setdefault(title, []).append(run._replace(film=film._replace(frames=film.frames[:0])))
+        runs.setdefault(title, []).append(run._replace(film=film._replace(frames=film.frames[:0].clone())))
 
 
 def show(found: dict[str, dict[str, float]]) -> None:
