@@ -97,11 +97,11 @@ class Noise(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """Of the blocks of B templates, (B, blocks) each: their weights' ``count``, the weighted sum of ``t`` less its mean
+    """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean
     and of its ``square``, the mean square of their slopes' texture, ``slope``; and which of those that hold pixels
     enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``: either."""
 
-    count: Tensor
+    weight: Tensor
     t: Tensor
     square: Tensor
     slope: Tensor
