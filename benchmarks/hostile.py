@@ -28,6 +28,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Container, Iterable, Iterator
+from contextlib import suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -227,8 +228,9 @@ def main(
     families = list(SCENES)[:2] if quick else list(SCENES)
     runs: Runs = {}
     films = chain(filmed(rows, wanted, shots(scenes, families)), made(own, wanted))
-    for name, film in track(films, "films", console=Console(stderr=True), transient=True):
-        followed(runs, name, film, by)
+    with suppress(KeyboardInterrupt):  # what there is by then is shown
+        for name, film in track(films, "films", console=Console(stderr=True), transient=True):
+            followed(runs, name, film, by)
     more, growth = soaked(soak_frames, by) if "soak" in wanted else ({}, [])
     runs |= more
     found = {title: figures(some) for title, some in runs.items()}
