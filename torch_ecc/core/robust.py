@@ -34,6 +34,7 @@ LARGEST_SLIP = 0.5  # where all do, as of blur, nothing need cover any of them
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS = 5
+CLEARLY_LESS = 0.85  # of the cost of least squares: where all edges fit worse, as by blur, leaving them out gains little
 FITS = 1.4  # median excess: nothing else is tried
 BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
 SETTLED = 0.01  # of the template's weight: trust changes no more
@@ -125,6 +126,7 @@ def solved_again(doubted: Doubted, start: Tensor, plain: Solution) -> tuple[Solu
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
     first = compared(doubted, variance, seen, usual_scale(doubted, plain, plain.gain.unsqueeze(1), SLIP))
     best, (least, fits) = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain)
+    least = CLEARLY_LESS * least
     for place, begin in ((there, first), (start, None), (there, None)):
         found = reweighted(doubted, place, begin or median_look(doubted, place))
         price, well = cost(doubted, found)
