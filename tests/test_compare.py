@@ -46,9 +46,9 @@ def write_track(folder, micrometres: bool = True, fps: float | None = 100.0, los
     return str(folder / "track.csv")
 
 
-def write_sensors(path, header="time_s,x_um,y_um,theta_urad", angle: float = 1e6, gap: range = range(0)) -> str:
-    t = torch.arange(0, 3.5, 1 / 1024).double()
-    rows = torch.cat((t[:, None], motion(t) * torch.tensor([1, 1, angle])), 1).tolist()
+def write_sensors(path, sense: tuple[int, int, int] = (1, 1, 1), gap: range = range(0)) -> str:
+    t, header = torch.arange(0, 3.5, 1 / 1024).double(), "time_s,x_um,y_um,theta_urad"
+    rows = torch.cat((t[:, None], motion(t) * torch.tensor([1, 1, 1e6]) * torch.tensor(sense)), 1).tolist()
     lines = [",".join(f"{v:.9g}" for v in row) for k, row in enumerate(rows) if k not in gap]
     path.write_text("\n".join((header, *lines)) + "\n")
     return str(path)
@@ -122,26 +122,47 @@ def test_what_is_estimated_is_up_to_the_user(tmp_path):
     assert abs(found["lever_x_um"]["value"]) < 4 * found["lever_x_um"]["sigma"]
 
 
-def test_opposite_angles_are_reported(tmp_path):
-    track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv", angle=-1e6)
-    assert "theta runs in opposite directions" in run(track, sensors, "--template", 1, "--out", tmp_path / "o").output
-    done = run(track, sensors, "--template", 1, "--flip-theta", "--out", tmp_path / "o")
-    assert "opposite directions" not in done.output
+SENSES = {
+    "+++": (1, 1, 1),
+    "++-": (1, 1, -1),
+    "+-+": (1, -1, 1),  # y upwards, theta from x to y
+    "+--": (1, -1, -1),
+    "-++": (-1, 1, 1),
+}
+
+
+@pytest.mark.parametrize("signs", SENSES)
+def test_axes_that_count_the_other_way_are_found_and_said(signs, tmp_path):
+    turned = SENSES[signs]
+    track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv", sense=turned)
+    done = run(track, sensors, "--template", 1, "--out", tmp_path / "o")
+    assert (f"--signs {signs}" in done.output) == (signs != "+++"), done.output
     figures = json.loads((tmp_path / "o" / "comparison.json").read_text())
-    assert figures["errors"]["estimated_at_once"]["theta_urad"]["rms"] == pytest.approx(NOISE_NM, rel=0.1)
+    assert tuple(figures["signs"].values()) == turned
+    offset = figures["estimated"]["offset_s"]
+    assert abs(offset["value"] - OFFSET) < 4 * offset["sigma"] < 1e-3
+    for name in ("x_nm", "y_nm", "theta_urad"):
+        assert figures["errors"]["estimated_at_once"][name]["rms"] == pytest.approx(NOISE_NM, rel=0.1)
+    told = run(track, sensors, "--template", 1, "--signs", signs, "--fixed-angle", "--out", tmp_path / "told")
+    assert told.exit_code == 0
+    again = json.loads((tmp_path / "told" / "comparison.json").read_text())
+    assert again["signs"] == figures["signs"]
 
 
 HEAD = "time_s,x_um,y_um,theta_urad\n"
 BAD_SENSORS = {
-    "columns": ("t,x,y,theta_urad\n0,1,2,3\n", "column time_s is missing; columns found: t, x, y, theta_urad"),
-    "semicolons": ("time_s;x_um\n1;2\n", "columns found: time_s;x_um"),
-    "no angle": ("time_s,x_um,y_um\n0,1,2\n", "expected one column of theta_rad, theta_urad, theta_deg"),
+    "no unit": ("t,x,y,theta_urad\n0,1,2,3\n", "column x has no unit: expected um, "),
+    "other unit": ("time_s,x [V],y_um\n0,1,2\n", "column x [V] is in 'V': expected um, "),
+    "columns": ("A,B,C\n0,1,2\n", "no column of times found, see --columns 'time=NAME' and --sensors-hz; columns found: A, B, C"),
+    "only times": ("time_s,A\n0,1\n", "no column of x, y or theta found"),
+    "two angles": (HEAD.strip() + ",theta_deg\n0,1,2,3,4\n", "theta may be any of theta_urad, theta_deg: choose one"),
     "word": (HEAD + "0,1,2,3\n1,one,2,3\n", "line 3, column x_um: expected a number, got 'one'"),
-    "unsorted": (HEAD + "0,1,2,3\n2,1,2,3\n1,1,2,3\n", "line 4: time_s must increase, 1 follows 2"),
+    "unsorted": (HEAD + "0,1,2,3\n2,1,2,3\n1,1,2,3\n", "line 4: times must increase, 1 follows 2"),
     "no time": (HEAD + "0,1,2,3\n,1,2,3\n", "line 3: time_s must be a finite number"),
     "short row": (HEAD + "0,1,2,3\n1,1,2\n", "line 3 must have 4 cells, got 3"),
-    "header only": (HEAD, "expected a header and rows of numbers, got 4 columns without a row"),
-    "empty": ("", "expected a header and rows of numbers, got 0 columns"),
+    "header only": (HEAD, "expected a header and rows of numbers, found no two columns of numbers"),
+    "empty": ("", "expected a header and rows of numbers, found no two columns of numbers"),
+    "binary": ("\x00\x01\x02\n\x03", "expected a header and rows of numbers"),
     "no poses": (HEAD + "0,,,\n1,,,\n2,,,\n3,,,\n", "sensors: expected at least 4 samples with a finite pose, got 0"),
     "apart": (HEAD + "".join(f"{1000 + k},{k},2,3\n" for k in range(9)), "the records do not overlap"),
 }

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from torch_ecc.core.pose import rotation
 from torch_ecc.records.curves import fit_circle, fit_ellipse, fit_line
 from torch_ecc.records.motion import Motion, check_motion, dwell_errors, nearest_errors
-from torch_ecc.records.synchrony import Curve, Unknowns, align_records, noise, spline_slopes
+from torch_ecc.records.spline import Curve, spline_slopes
+from torch_ecc.records.synchrony import Unknowns, align_records, noise
 
 OFFSET, ANGLE, LEVER = 0.337, 0.01, (800.0, -500.0)
 NEAR = Unknowns(max_offset_s=0.4)
@@ -147,7 +148,8 @@ def test_exposure_is_averaged_over():
     """Of a 20 Hz sine, an exposure T leaves sinc(f T)."""
     t, s = torch.arange(0.1, 4, 0.01).double(), torch.arange(0, 5, 1 / 4096).double()
     wave = lambda u: torch.stack(((20 * math.tau * u).sin(), 0 * u, 0 * u), -1)  # noqa: E731
-    value, speed, inside = Curve(Motion(s, wave(s)), 0.008)(t)
+    curve = Curve(Motion(s, wave(s)), 0.008)
+    (value, inside), speed = curve(t), curve.speed(t)
     expected = math.sin(math.pi * 0.16) / (math.pi * 0.16)
     assert inside.all()
     assert torch.allclose(value, expected * wave(t), atol=2e-3)
@@ -207,7 +209,7 @@ def test_bad_records(motion, message):
 def test_records_apart():
     track, sensors = records()
     with pytest.raises(ValueError, match="align: the records do not overlap, see max_offset_s"):
-        align_records(Motion(track.time_s + 100, track.pose), sensors)
+        align_records(Motion(track.time_s + 100, track.pose), sensors, Unknowns(max_offset_s=2.0))
 
 
 @pytest.mark.parametrize("name", ["exposure_s", "max_offset_s"])
