@@ -143,7 +143,7 @@ def _unit_of(log: Log, role: str, name: str) -> str:
 def _unit_of_time(log: Log, name: str, known: str | None) -> str:
     """The unit of the header, "" for times in words, that of a number since 1970 by its size, else s."""
     cells = [cell for cell in log.column(name)[:100].tolist() if cell.lower() not in MISSING]
-    if any(_CLOCK.search(cell) for cell in cells[:1]):
+    if cells and (_ISO.match(cells[0]) or _CLOCK.search(cells[0])):
         return ""
     if known is not None:
         return known

@@ -154,8 +154,8 @@ def _layout(sample: Sequence[str]) -> _Layout:
     rows = tables[separator]
     width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
     whole = [row for row in rows if len(row) == width]
-    values = (k for k in range(width) if 2 * sum(_is_value(row[k]) or not row[k] for row in whole) > len(whole))
-    return _Layout(separator, width, frozenset(values))
+    columns = [[_is_value(row[k]) for row in whole if row[k]] for k in range(width)]
+    return _Layout(separator, width, frozenset(k for k, column in enumerate(columns) if 2 * sum(column) > len(column)))
 
 
 def _names(preamble: Sequence[tuple[int, str]], layout: _Layout) -> tuple[str, ...]:

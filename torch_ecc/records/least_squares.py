@@ -102,7 +102,9 @@ def _covariance(residual: Tensor, jacobian: Tensor, errors: _Errors, places: lis
     white, design = errors.white(residual), errors.white(jacobian)
     found = solve(white, design)
     influence = (design * white[..., None]).sum(1) @ found.inverse
-    covariance = influence.mT @ influence * (len(influence) / max(len(influence) - len(found.step), 1))
+    share = torch.einsum("nkp,pq,nkq->n", design, found.inverse, design).clamp(max=0.9)  # of the fit, in its own error
+    influence = influence / (1 - share)[:, None]
+    covariance = influence.mT @ influence
     # A sandwich is a guess from few frames where few of them tell something: it is not let below the plain covariance.
     short = (found.inverse.diagonal() / covariance.diagonal().clamp(min=1e-300)).clamp(min=1.0).sqrt()
     covariance = short[:, None] * covariance * short
