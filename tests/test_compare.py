@@ -43,7 +43,8 @@ def write_track(folder, micrometres: bool = True, fps: float | None = 100.0, los
             status = torch.tensor([0, 2 if k in lost else 0], dtype=torch.int8)
             flat = torch.ones(2)
             covariance = 1e-6 * torch.eye(3).double().expand(2, 3, 3)
-            writer.write(Estimate(moved + 300.0, moved, flat, status, flat.int(), covariance, flat, 0 * status))
+            fields = {"pose": moved + 300.0, "displacement": moved, "status": status, "covariance": covariance}
+            writer.write(Estimate(**{name: fields.get(name, flat) for name in Estimate._fields}))
     return str(folder / "track.csv")
 
 
