@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from torch_ecc.records.whitening import autoregression, highest_order, whiten
+from torch_ecc.records.whitening import autoregression, whiten
 
 FLOOR = (1e-6, 1e-6, 1e-9)  # um, um, rad: below this a record is exact
 STEPS = 50
@@ -139,7 +139,7 @@ def solve(residual: Tensor, jacobian: Tensor) -> _Solution:
 
 
 def _white(values: Tensor, coefficients: list[Tensor]) -> Tensor:
-    drop = highest_order(len(values))
+    drop = max(map(len, coefficients))
     return torch.stack([whiten(values[:, k], a, drop) for k, a in enumerate(coefficients)], 1)
 
 

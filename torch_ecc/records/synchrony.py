@@ -69,6 +69,8 @@ class Unknowns:
         """Every sense of the axes to be tried, as they are first. A turn takes x the other way where y is."""
         x, y, theta = components.tolist()
         angle, lever = self.angle and x and y, self.lever and theta
+        if angle:  # a turn takes one for the other
+            weight = torch.cat((weight[:2].square().mean().sqrt().expand(2), weight[2:]))
         if self.signs is not None:
             return [Sense(self.signs, angle, lever, weight)]
         both = (1.0, -1.0)
@@ -250,6 +252,7 @@ def _fit(model: _Model, start: Start) -> _Fit | None:
     p = torch.zeros(len(NAMES), dtype=torch.float64)
     p[0], p[1], p[5] = start.offset_s, start.angle, 1.0
     try:
+        p[ZEROS] -= model(p, start.signs)[0].mean(0)
         p, residual = ordinary(lambda q: model(q, start.signs)[:2], p, model.free)
     except ValueError:
         return None
