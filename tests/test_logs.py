@@ -62,6 +62,8 @@ SHAPES = {
     "spaces": "%  t/s      x/um     y/um   theta/urad\n" + table("   ", *PLAIN),
     "ISO": "timestamp,x_um,y_um\n" + table(",", stamps("%Y-%m-%dT%H:%M:%S.%fZ"), *XY),
     "clock": "Date,Time,x_um,y_um\n" + table(",", stamps("%m/%d/%Y"), stamps("%I:%M:%S.%f %p"), *XY),
+    "minutes": "time,StageX_um,StageY_um\n"
+    + table(",", [f"{59 + int(t + 59) // 60}:{(59 + t) % 60:05.2f}" for t in T.tolist()], *XY),
     "epoch in ns": "time,x_um,y_um\n" + table(",", NS, *XY),
     "no header": table(",", *PLAIN),
     "no times": "n,CH 1,CH 2\n" + table(",", [f"{k}" for k in range(COUNT)], *XY),
@@ -76,7 +78,7 @@ OPTIONS = {
     "no times": ("x=CH 1:um; y=CH 2:um", RATE),
     "theta not wanted": ("theta=", None),
 }
-NO_ANGLE = {"quoted", "thousands", "ISO", "clock", "epoch in ns", "no times", "words", "theta not wanted"}
+NO_ANGLE = {"minutes", "quoted", "thousands", "ISO", "clock", "epoch in ns", "no times", "words", "theta not wanted"}
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -95,6 +97,13 @@ def test_times_since_1970_and_midnight(tmp_path):
     for shape, start in (("ISO", START.timestamp()), ("epoch in ns", START.timestamp()), ("clock", 86399.7)):
         (tmp_path / "log").write_text(SHAPES[shape])
         assert read_sensors(tmp_path / "log").time_s[0] == pytest.approx(start, abs=1e-5)
+
+
+def test_what_is_no_text_is_said(tmp_path):
+    for start, kind in ((b"PK\x03\x04", "a workbook"), (b"TDSm", "a TDMS file")):
+        (tmp_path / "log").write_bytes(start + bytes(range(256)))
+        with pytest.raises(ValueError, match=f"expected a table in text, this is {kind}: save it as CSV first"):
+            read_log(tmp_path / "log")
 
 
 @pytest.mark.parametrize("word", ["", "NaN", "-nan", "#N/A", "---", "NULL", "1.#QNAN", "inf"])

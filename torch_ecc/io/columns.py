@@ -29,6 +29,7 @@ EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # a number so large counts 
 ABSCISSA = {"x_value", "x-value"}  # what LabVIEW calls the time
 DAY = 86400.0
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d*)?))?\s*([ap])?\.?m?\.?$", re.IGNORECASE)
+_MINUTES = re.compile(r"(\d{1,2}):(\d{2}[.,]\d+)$")  # as spreadsheets show times with fractions
 _ISO = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:")
 
 
@@ -102,7 +103,8 @@ def _says(name: str, role: str) -> bool:
     if name.lower() in ABSCISSA:
         return role == "time"
     bare, _ = _parts(name)
-    words = [word for word in re.split(r"[\W_]+", bare.lower()) if word]
+    words = [word for word in re.split(r"[\W_]+|(?<=[a-z])(?=[A-Z])", bare) if word]
+    words = [word.lower() for word in words]
     rest = [word for word in words if word not in FILLERS] or words
     return "".join(rest) in NAMES[role]
 
@@ -143,7 +145,7 @@ def _unit_of(log: Log, role: str, name: str) -> str:
 def _unit_of_time(log: Log, name: str, known: str | None) -> str:
     """The unit of the header, "" for times in words, that of a number since 1970 by its size, else s."""
     cells = [cell for cell in log.column(name)[:100].tolist() if cell.lower() not in MISSING]
-    if cells and (_ISO.match(cells[0]) or _CLOCK.search(cells[0])):
+    if cells and any(form.search(cells[0]) for form in (_ISO, _CLOCK, _MINUTES)):
         return ""
     if known is not None:
         return known
@@ -174,6 +176,8 @@ def _since_1970(cell: str) -> float:
 
 
 def _of_day(cell: str) -> float:
+    if minutes := _MINUTES.match(cell):
+        return 60.0 * int(minutes[1]) + float(minutes[2].replace(",", "."))
     match = _CLOCK.search(cell)
     if not match:
         raise ValueError(cell)

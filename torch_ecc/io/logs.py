@@ -39,7 +39,10 @@ MISSING = {
     "-1.#ind",
 }
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)*|[.,]\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
-_INSTANT = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}.*|\d{1,2}:\d{2}(:\d{2}.*)?")  # a date or a time of the day
+_INSTANT = re.compile(
+    r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}.*|\d{1,2}:\d{2}(:\d{2}.*|[.,]\d+)?"
+)  # a date or a time of the day
+BINARY = {b"PK\x03\x04": "a workbook", b"TDSm": "a TDMS file", b"\x89HDF": "an HDF5 file", b"MATLAB 5": "a MAT file"}
 
 
 class Log(NamedTuple):
@@ -92,7 +95,11 @@ def read_log(path: str | Path) -> Log:
     path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")
-    text = _decode(path.read_bytes())
+    data = path.read_bytes()
+    for start, kind in BINARY.items():
+        if data.startswith(start):
+            raise ValueError(f"{path}: expected a table in text, this is {kind}: save it as CSV first")
+    text = _decode(data)
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     layout = _layout([line for _, line in lines[-SAMPLE:]])
     rows = [(number, _fitted(row, layout.width)) for number, row in _split(lines, layout.separator)]
