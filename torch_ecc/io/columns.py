@@ -176,8 +176,9 @@ def _since_1970(cell: str) -> float:
 
 
 def _of_day(cell: str) -> float:
-    if minutes := _MINUTES.match(cell):
-        return 60.0 * int(minutes[1]) + float(minutes[2].replace(",", "."))
+    short = _MINUTES.match(cell)
+    if short:
+        return 60.0 * int(short[1]) + float(short[2].replace(",", "."))
     match = _CLOCK.search(cell)
     if not match:
         raise ValueError(cell)
