@@ -133,25 +133,30 @@ def test_clocks_may_be_any_time_apart(apart):
 @pytest.mark.parametrize("signs", [(1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, 1)])
 @pytest.mark.parametrize("turn", [0.0, 1.5, -1.2])
 def test_the_sense_of_the_axes_is_found(signs, turn):
-    """Also with x and y exchanged, and with a lever arm that turns the way the stage does."""
-    track, sensors = records(5.0, turn=0.004, lever=LEVER)
-    pose = track.pose.clone()
+    """Also with x and y exchanged; a lever arm turns as the stage does in the image, not as its sensors count."""
+    track, sensors = records(5.0, turn=0.004)
+    pose, lever = track.pose.clone(), torch.tensor(LEVER).double()
+    angle = math.prod(signs) * truth(track.time_s + OFFSET, 0.004)[:, 2]
+    arm = (rotation(angle) - torch.eye(2)) @ lever
+    pose[:, :2] += arm @ rotation(torch.tensor(ANGLE).double())
     pose[:, :2] = pose[:, :2] @ rotation(torch.tensor(turn).double())
     pose = pose * torch.tensor(signs).double()
-    physical = math.prod(signs)  # the sensors' theta, by the sense of their axes
-    seen = Motion(sensors.time_s, sensors.pose * torch.tensor([1, 1, 1.0]).double())
-    found = align_records(Motion(track.time_s, pose), seen, Unknowns(signs=None, max_offset_s=0.4))
-    assert found.signs.tolist() == list(map(float, signs)) or physical < 0
-    assert abs(found.offset_s - OFFSET) < 5 * found.sigma["offset_s"]
+    found = align_records(Motion(track.time_s, pose), sensors, Unknowns(signs=None, lever=True, max_offset_s=0.4))
+    assert math.prod(found.signs.tolist()) == math.prod(signs)
+    assert found.signs[2] == signs[2]
+    assert abs(found.offset_s - OFFSET) < 5 * found.sigma["offset_s"] < 1e-3
+    assert (
+        (found.lever - lever).abs() < 5 * torch.tensor([found.sigma["lever_x_um"], found.sigma["lever_y_um"]])
+    ).all()
+    assert torch.allclose(found.rms, 5 * torch.tensor([1e-3, 1e-3, 1e-6]).double(), rtol=0.1)
 
 
 @pytest.mark.parametrize("missing", [(2,), (0, 2), (1, 2), (0, 1)])
 def test_components_that_the_sensors_do_not_have(missing):
     """Nothing is asked of them, and the rest is as good as it can be."""
     track, sensors = records(5.0, turn=0.004)
-    angle = math.nan if len(missing) > 1 else ANGLE
-    pose = track.pose.clone()
-    if len(missing) > 1:  # then the axis angle is taken as given
+    pose, plane = track.pose.clone(), len(missing) == 1
+    if not plane:  # then the axis angle is taken as given
         pose[:, :2] = pose[:, :2] @ rotation(torch.tensor(-ANGLE).double())
     sensors.pose[:, list(missing)] = math.nan
     found = align_records(Motion(track.time_s, pose), sensors, NEAR)
@@ -159,7 +164,7 @@ def test_components_that_the_sensors_do_not_have(missing):
     assert found.errors[found.valid][:, missing].isnan().all()
     assert torch.allclose(found.rms[there], (5 * torch.tensor([1e-3, 1e-3, 1e-6]).double())[there], rtol=0.1)
     assert abs(found.offset_s - OFFSET) < 5 * found.sigma["offset_s"]
-    assert ("axis_angle_rad" in found.names) == (not math.isnan(angle))
+    assert ("axis_angle_rad" in found.names) == plane
 
 
 def test_a_motion_that_repeats_itself_has_rivals():
