@@ -156,10 +156,13 @@ def test_settings_reach_the_engine(tmp_path):
         "tolerance": 0.01,
         "min_score": 0.7,
         "min_visible": 0.4,
+        "robust": False,
         "backend": "torch",
     }
     assert other.keys() == {each.name for each in dataclasses.fields(Settings)} & OFFERED.keys()
-    options = [f"--{name.replace('_', '-')}={value}" for name, value in other.items()]
-    text = written(str(tmp_path / "video.npy"), "--center", "45", "45", "--size", "31", *options)
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in other.items() if value is not False] + [
+        "--no-robust"
+    ]
+    text = written(str(tmp_path / "video.npy"), "--center", "45", "45", "--size", "31", "--no-robust", *options)
     session = Session(fill(TrackJob, tomllib.loads(text), "written"))
     assert session.tracker.settings == Settings(**other)

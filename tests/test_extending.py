@@ -94,4 +94,4 @@ def test_a_light(monkeypatch):
         u, v = (2 / (SIZE - 1) * transform(inverse(PATH[k]), points)).clamp(-1.5, 1.5).T.reshape(2, *FRAME)
         stack[k] *= 1 + 0.3 * u**3 - 0.2 * v**3 + 0.1 * u
     assert error(stack, illumination="cubic") < 5e-3
-    assert error(stack, illumination="quadratic") > 5e-2
+    assert error(stack, illumination="quadratic", robust=False) > 5e-2

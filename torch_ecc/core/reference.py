@@ -98,9 +98,10 @@ class Noise(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean
-    and of its ``square``, the mean square of their slopes' texture, ``slope``, or of those around, if that is more; and which of those that hold pixels
-    enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``: either."""
+    """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean and of
+    its ``square``, the mean square of the texture's slopes, or of those around if that is more, ``slope``; and which of
+    those that hold pixels enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``:
+    either."""
 
     weight: Tensor
     t: Tensor

@@ -25,12 +25,14 @@ from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywher
 from torch_ecc.search.nearby import Nearby
 
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
+ANYWHERE_MARGIN = (3.0, 0.03)  # (a, b): a place of score s may be the template's if 1 - s <= a (1 - s_usual) + b
 AT_ONCE = 8  # templates searched for in the whole of one frame; the others in turn
 NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
 SELDOM = 16  # frames between two searches for what has been lost for long
 NOISE_ALONE = 1.3  # times as much noise in some direction as there may be: no place can be told from the next one
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
+SLID = 16.0  # px beyond the last step: where something else was tracked, if it does not look as usual either
 FEWEST_TOGETHER = 3  # templates that must have gone the same way for others to be looked for there
 TOGETHER = 3.0  # px: they have gone the same way, and more than half of those that were found have
 
@@ -55,15 +57,21 @@ def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
 def plausible(estimate: Estimate, start: Tensor, past: Past, radius: Tensor) -> Tensor:
     """Places (R,) that were tracked to, look familiar, and lie about as close to the ``start`` (R, 3) as that does to
     the last pose."""
+    near = ~strayed(estimate, start, past, radius, BASIN)
+    return Status.good(estimate.status) & (estimate.score >= FAMILIAR * past.usual) & near
+
+
+def strayed(estimate: Estimate, start: Tensor, past: Past, radius: Tensor, most: float) -> Tensor:
+    """Which places (R,) lie over ``most`` px farther from the ``start`` (R, 3) than that does from the last pose."""
     step, last = (pose_distance(start, pose, radius=radius) for pose in (estimate.pose, past.pose))
-    familiar = estimate.score >= FAMILIAR * past.usual
-    return Status.good(estimate.status) & familiar & (step <= BASIN + last)
+    return step > most + last
 
 
 def disbelieved(estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, radius: Tensor) -> Estimate:
-    """The ``estimate`` in which those that are still suspect, and not where they are plausible, are lost."""
-    doubted = torch.tensor(suspects, device=start.device) & ~plausible(estimate, start, past, radius)
-    lost = doubted & Status.good(estimate.status)
+    """The ``estimate`` in which those that are still suspect, and have slid away from where they were expected, are
+    lost."""
+    slid = (estimate.origin == Origin.TRACKED) & strayed(estimate, start, past, radius, SLID)
+    lost = torch.tensor(suspects, device=start.device) & slid & Status.good(estimate.status)
     return estimate._replace(
         status=torch.where(lost, int(Status.LOST), estimate.status).to(torch.int8),
         covariance=torch.where(lost[:, None, None], unknown(estimate.covariance), estimate.covariance),
@@ -96,7 +104,7 @@ class Recovery:
     @lasting
     def __init__(self, reference: Reference, settings: Settings, turn: Tensor) -> None:
         # A wrong place must not be made right by leaving out what does not fit.
-        self.reference, self.settings, self.partly = reference, replace(settings, robust=False), settings
+        self.reference, self.settings = reference, replace(settings, robust=False)
         self.turn = turn  # whose turn it is if they are many, (): the tracker's, written in place
         self.expected = expected_score(reference)
         self.textureless, self.hopeless = textureless(reference, settings)
@@ -117,10 +125,10 @@ class Recovery:
         estimate = self.follow(images[0], self.own(found, estimate, start, past), start, past.usual)
         suspects = suspect(estimate, past.usual)
         kept = plausible(estimate, start, past, self.reference.place.radius).tolist()
-        strayed = [r for r in due if suspects[r] and not kept[r]][:AT_ONCE]
-        for r in strayed:
+        gone = [r for r in due if suspects[r] and not kept[r]][:AT_ONCE]
+        for r in gone:
             estimate = self.search_anywhere(images, estimate, past, r)
-        return self.follow(images[0], estimate, start, past.usual) if strayed else estimate
+        return self.follow(images[0], estimate, start, past.usual) if gone else estimate
 
     def due(self, estimate: Estimate, past: Past) -> list[int]:
         """Which of the suspect templates to search for in this frame: less often those that have a place or too little
@@ -140,21 +148,9 @@ class Recovery:
     def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor, due: list[int]) -> Estimate:
         """Second attempt for the templates ``due``: around their ``start`` (R, 3)."""
         index = torch.tensor(due, device=start.device)
-        view, surroundings = image if len(image) == 1 else image[index], self.surroundings(due)
-        found = surroundings.find(self.reference.select(index), view, start[index], self.settings)
-        known = familiar(found, usual[index]) & beats(found, estimate.at(index))
-        estimate = estimate.put(index[known], found.at(known))
-        if not self.partly.robust or bool(known.all()):
-            return estimate
-        place, _ = surroundings.candidates(view, start[index], 1)  # something may cover a part of them
-        return self.put_partly(image, estimate, place[~known, 0], usual, index[~known])
-
-    def put_partly(self, image: Tensor, estimate: Estimate, place: Tensor, usual: Tensor, index: Tensor) -> Estimate:
-        """The ``estimate`` with those at ``index`` (n,) that are there if only a part is looked at, at ``place``."""
         view = image if len(image) == 1 else image[index]
-        found = solve(self.reference.select(index), view, place, self.partly, None, usual[index])
+        found = self.surroundings(due).find(self.reference.select(index), view, start[index], self.settings)
         known = familiar(found, usual[index]) & beats(found, estimate.at(index))
-        found = found._replace(origin=torch.full_like(found.origin, int(Origin.NEARBY)))
         return estimate.put(index[known], found.at(known))
 
     def search_anywhere(self, images: list[Tensor], estimate: Estimate, past: Past, r: int) -> Estimate:
@@ -162,12 +158,14 @@ class Recovery:
         locator, pose = self.locator(r, (images[0].shape[-2], images[0].shape[-1])), past.pose[r]
         images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
-        found, score = locator.candidates(views, 0, pose)
+        found, _ = locator.candidates(views, 0, pose)
         if found.status[0] != Status.CONVERGED:
             return estimate
         index = torch.tensor([r], device=pose.device)
         best = found.at(index.new_zeros(1))
-        if not (familiar(best, past.usual[index]) & beats(best, estimate.at(index))):
+        a, b = ANYWHERE_MARGIN
+        known = 1 - best.score <= a * (1 - past.usual[index]) + b
+        if not (known & beats(best, estimate.at(index))):
             return estimate
         radius = self.reference.place.radius[r]
         distance = pose_distance(best.pose[0], pose, radius=radius)
