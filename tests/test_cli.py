@@ -132,7 +132,7 @@ def wrong(tmp_path) -> dict[str, tuple[list[str], str]]:
         "broken video": ([str(tmp_path / "broken.mp4"), *good[1:]], "broken.mp4"),
         "unknown extension": ([str(tmp_path / "notes.txt"), *good[1:]], "'.txt', which is not known"),
         "not a stack": ([str(tmp_path / "line.npy"), *good[1:]], "line.npy"),
-        "nan": ([str(tmp_path / "nan.npy"), *good[1:]], "must be finite"),
+        "nan": ([str(tmp_path / "nan.npy"), *good[1:]], "it holds NaN or infinite values"),
         "no camera": (["97", *good[1:]], "camera 97"),
         "no center": ([video, "--size", "41"], "expected at least one"),
         "no size": ([video, "--center", "80", "60"], "size: expected the side of the templates"),

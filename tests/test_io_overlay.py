@@ -35,7 +35,7 @@ def drawn(folder: Path, frame: Tensor, *records: Report, shapes=((121, 161),)) -
             writer.write(frame, record)
     assert writer.path == folder / "overlay"
     *_, last = open_frames(folder / "overlay")
-    return last.permute(1, 2, 0).numpy().astype(int)
+    return last.picture().permute(1, 2, 0).numpy().astype(int)
 
 
 def coloured(picture: np.ndarray) -> np.ndarray:
@@ -161,7 +161,7 @@ def test_deep_frames_are_stretched_by_the_first_one(tmp_path):
         writer.write(ramp, record)
         writer.write(ramp / 2, record)
     _, second = open_frames(tmp_path / "two" / "overlay")
-    np.testing.assert_allclose(second[0, 20], wanted / 2, atol=2)
+    np.testing.assert_allclose(second.picture()[0, 20], wanted / 2, atol=2)
 
 
 def test_8_bit_frames_stay_as_they_are(tmp_path):

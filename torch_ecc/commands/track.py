@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,10 +66,8 @@ class Session:
         self.job, self.calibration = job, job.calibration()
         crops = read_templates(job)
         self.templates = choose_templates(job) if crops is None else Templates.of(crops)
-        self.source = open_frames(job.input)
-        frames = iter(self.source)
-        first = next(frames) if job.reference is None else next(iter(open_frames(job.reference)))
-        self.frames = frames if job.reference else chain((first,), frames)
+        self.source = open_frames(job.input, fps=job.fps)
+        first = self.source.first if job.reference is None else open_frames(job.reference).first
         centers, size, mask = self.templates
         if crops is None:
             self.tracker = Tracker(first, centers, size, mask=mask, **job.options())
@@ -81,7 +78,7 @@ class Session:
         if self.source.shape != first.shape[-2:]:
             (h, w), (h0, w0) = self.source.shape, first.shape[-2:]
             raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
-        self.fps = job.fps if job.fps is not None else self.source.fps
+        self.fps = self.source.fps
 
     def run(self, progress: Callable[[Estimate], None] = lambda estimate: None) -> Finished:
         """Track every frame and write DIR/track.csv, track.npz, track.png, summary.json and overlay.mp4.
@@ -96,13 +93,12 @@ class Session:
         writer, overlay = self._writers(folder)
         try:
             with writer, overlay:
-                for number, frame in enumerate(self.frames):
-                    try:
-                        estimate = self.tracker(frame)
-                    except ValueError as error:
-                        raise ValueError(f"frame {number}: {error}") from error
+                for frame in self.source:
+                    if frame.pixels is None:
+                        raise ValueError(f"frame {frame.number}: {frame.damage}")
+                    estimate = self.tracker(frame.pixels)
                     writer.write(estimate)
-                    overlay.write(frame, estimate)
+                    overlay.write(frame.picture(), estimate)
                     last = estimate.status.cpu().long()
                     lost += ~Status.good(last)
                     done += 1
@@ -141,7 +137,7 @@ def read_templates(job: TrackJob) -> Tensor | None:
             raise ValueError(f"{name}: not with template, whose image tells it all; got {given}")
     if job.centers and len(job.centers) != len(job.template):
         raise ValueError(f"centers: expected one per template ({len(job.template)}), got {len(job.centers)}")
-    crops = [as_gray("template", name, next(iter(open_frames(name)))) for name in job.template]
+    crops = [as_gray("template", name, open_frames(name).first) for name in job.template]
     sizes = {f"{crop.shape[-1]}x{crop.shape[-2]}" for crop in crops}
     if len(sizes) > 1:
         raise ValueError(f"template: expected images of one size, got {sorted(sizes)} px")

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from torch_ecc.io.frames import FrameError, Medium, Pixels
+from torch_ecc.io.frames import FrameError, Medium, Pixels, counted
 
 TIFF = frozenset({".tif", ".tiff"})
 IMAGES = TIFF | {".png", ".bmp", ".jpg", ".jpeg", ".jp2", ".webp", ".pgm", ".ppm", ".pnm"}
@@ -39,7 +39,7 @@ def open_images(paths: Sequence[Path], where: str) -> Medium:
     if len(kinds) > 1:
         found = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
         raise ValueError(f"open_frames: several kinds of image in {where} ({found}); name one, as in '*{min(kinds)}'")
-    return Medium(lambda: _read_files(images), len(images), label=lambda index: images[index].name)
+    return Medium(counted(lambda: _read_files(images)), len(images))
 
 
 def _read_files(paths: Sequence[Path]) -> Iterator[Pixels]:
@@ -81,7 +81,7 @@ def open_tiff(path: Path) -> Medium:
             f"open_frames: {path} is an ImageJ stack of {hidden[1]} images with {length} TIFF page(s): "
             "save it as an image sequence or in parts under 4 GB"
         )
-    return Medium(lambda: _read_pages(path), length, label="page {}".format)
+    return Medium(counted(lambda: _read_pages(path)), length)
 
 
 def _read_pages(path: Path) -> Iterator[Pixels]:

@@ -11,7 +11,7 @@ from torch_ecc.io.stacks import open_npy, open_npz
 from torch_ecc.io.video import VIDEOS, open_camera, open_video
 
 
-def open_frames(source: str | Path | int) -> FrameSource:
+def open_frames(source: str | Path | int, *, fps: float | None = None) -> FrameSource:
     """A stream of frames from whatever ``source`` is.
 
     A video file; an image; a folder or a glob (``"run3/*.png"``) of images in natural order; a multi-page TIFF of 8 or
@@ -22,15 +22,15 @@ def open_frames(source: str | Path | int) -> FrameSource:
     Raises FileNotFoundError where nothing is there, and ValueError for what cannot be read, in words.
     """
     if isinstance(source, int):
-        return FrameSource(f"camera {source}", open_camera(source))
+        return FrameSource(f"camera {source}", open_camera(source), fps=fps)
     text = str(source).strip()
     if text.isdecimal():
-        return FrameSource(f"camera {int(text)}", open_camera(int(text)))
+        return FrameSource(f"camera {int(text)}", open_camera(int(text)), fps=fps)
     path = Path(text).expanduser()
     if text and path.exists():
-        return FrameSource(path.name or str(path), _open_path(path))
+        return FrameSource(path.name or str(path), _open_path(path), fps=fps)
     if any(wildcard in text for wildcard in "*?["):
-        return _open_glob(path)
+        return _open_glob(path, fps)
     raise FileNotFoundError(f"open_frames: no such file, folder or camera: {text!r}")
 
 
@@ -60,10 +60,10 @@ def _open_folder(folder: Path) -> Medium:
     return open_images(files, f"the folder {folder}")
 
 
-def _open_glob(pattern: Path) -> FrameSource:
+def _open_glob(pattern: Path, fps: float | None) -> FrameSource:
     files = [Path(match) for match in glob(str(pattern), recursive=True)]
     if not files:
         raise FileNotFoundError(f"open_frames: no file matches {str(pattern)!r}")
     if len(files) == 1:
-        return FrameSource(files[0].name, _open_path(files[0]))
-    return FrameSource(pattern.name, open_images(files, f"the {len(files)} files that match {str(pattern)!r}"))
+        return FrameSource(files[0].name, _open_path(files[0]), fps=fps)
+    return FrameSource(pattern.name, open_images(files, f"the {len(files)} files that match {str(pattern)!r}"), fps=fps)

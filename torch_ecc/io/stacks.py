@@ -16,7 +16,7 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from torch_ecc.io.frames import FrameError, Medium, Pixels, check_dtype
+from torch_ecc.io.frames import FrameError, Medium, Pixels, check_dtype, counted
 
 _SHAPES = "(F, H, W), (F, H, W, channels) or (F, channels, H, W) with 1, 3 or 4 channels"
 _DAMAGE = (OSError, EOFError, BadZipFile, zlib.error)
@@ -57,7 +57,7 @@ def _open_member(path: Path, key: str) -> Iterator[IO[bytes]]:
 def _medium(opener: _Opener, where: str) -> Medium:
     with opener() as stream:
         layout = _read_header(stream, where)
-    return Medium(lambda: _read(opener, where), layout.frames)
+    return Medium(counted(lambda: _read(opener, where)), layout.frames)
 
 
 def _read_header(stream: IO[bytes], where: str) -> _Layout:

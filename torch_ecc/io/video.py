@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 
-from torch_ecc.io.frames import FrameError, Medium, Pixels
+from torch_ecc.io.frames import FrameError, Medium, Pixels, counted
 
 VIDEOS = frozenset(
     ".avi .gif .m4v .mjpeg .mjpg .mkv .mov .mp4 .mpeg .mpg .mts .ogv .ts .webm .wmv .y4m".split()  # noqa: SIM905
@@ -23,7 +23,9 @@ def open_video(path: Path) -> Medium:
     capture.release()
     if not opened:
         raise ValueError(f"open_frames: {path} cannot be opened as a video (damaged, or a codec OpenCV does not have)")
-    return Medium(lambda: _read_video(path, max(count, 0), fps), count if count > 0 else None, fps)
+    return Medium(
+        counted(lambda: _read_video(path, max(count, 0), fps), fps), count if count > 0 else None, fps, exact=False
+    )
 
 
 def open_camera(index: int) -> Medium:
@@ -33,7 +35,7 @@ def open_camera(index: int) -> Medium:
     capture = cv2.VideoCapture(index)
     if not capture.isOpened():
         raise ValueError(f"open_frames: camera {index} cannot be opened")
-    return Medium(lambda: _read_camera(capture, index), None, _fps(capture))
+    return Medium(counted(lambda: _read_camera(capture, index)), None, _fps(capture))
 
 
 def _fps(capture: cv2.VideoCapture) -> float | None:
