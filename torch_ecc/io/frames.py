@@ -186,6 +186,16 @@ def _length(medium: Medium, numbers: range) -> int | None:
     return len(range(numbers.start, min(numbers.stop, medium.length), numbers.step))
 
 
+MOST_PIXELS = 1 << 28  # of one frame: beyond it a header is a mistake or an attack
+
+
+def check_size(where: str, width: int, height: int) -> None:
+    """ValueError for a frame beyond ``MOST_PIXELS``, before its memory is asked for."""
+    if width * height > MOST_PIXELS:
+        most = f"{MOST_PIXELS >> 20} Mpx"
+        raise ValueError(f"{where} claims {width} x {height} px; frames of up to {most} can be read")
+
+
 def check_dtype(dtype: np.dtype[Any], where: str) -> None:
     """ValueError unless ``dtype`` holds real numbers or booleans."""
     if dtype.kind not in "buif":
@@ -220,16 +230,3 @@ def _convert(array: Pixels) -> Pixels:
     if array.dtype.kind == "f" and not np.isfinite(floats.sum(dtype=np.float64)):
         raise ValueError("holds NaN or infinite values")
     return floats
-
-
-def counted(arrays: Callable[[], Iterator[Pixels]], fps: float | None = None) -> Callable[[range], Iterator[Raw]]:
-    """``Medium.read`` of what can only be read from its start on, at a constant rate."""
-
-    def read(numbers: range) -> Iterator[Raw]:
-        for index, array in enumerate(arrays()):
-            if index >= numbers.stop:
-                return
-            if index in numbers:
-                yield Raw(index, array, None if fps is None else index / fps)
-
-    return read

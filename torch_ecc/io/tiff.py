@@ -1,0 +1,182 @@
+"""TIFF of every kind, through tifffile: its pages, or the planes of the axes that it describes, one at a time.
+
+What tifffile cannot decode, for want of a codec or for its colours, is left to Pillow.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tifffile
+from PIL import Image
+
+from torch_ecc.io.axes import Choice, Walk, walk
+from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, check_dtype, check_size
+from torch_ecc.io.tags import read_tags
+
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds wrong is said here, not on the screen
+
+TIFF = frozenset({".tif", ".tiff", ".btf", ".tf8", ".lsm", ".stk"})
+_DESCRIBED = ("shaped", "lsm", "mmstack", "ome", "imagej", "ndtiff", "fluoview", "stk", "scanimage", "nih")
+_MADE_RGB = ("SEPARATED", "CIELAB", "ICCLAB", "ITULAB")  # colours that tifffile leaves as they are
+_LONGEST_REASON = 160
+
+
+class _Planes(NamedTuple):
+    """The planes of a file by number, the way through them, how many frames are promised, and the position read."""
+
+    read: Callable[[int], Pixels]
+    walk: Walk
+    promised: int
+    position: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def open_tiff(path: Path, choice: Choice) -> Medium:
+    """One frame per page, or per time where the file describes its axes. ValueError if it is no TIFF, or if it has
+    channels, slices or positions and none is chosen."""
+    try:
+        tif: Any = tifffile.TiffFile(path)
+        page = tif.pages.first
+    except Exception as error:  # whatever a parser stumbles on in what is no TIFF
+        raise ValueError(f"open_frames: {path} cannot be read as TIFF ({_reason(error)})") from error
+    if page.dtype is not None:
+        check_dtype(page.dtype, path.name)
+    planes = _described(tif, path, choice) or _pages(tif, path, choice)
+    tags, lock = read_tags(tif, planes.position), threading.Lock()
+
+    def read(numbers: range) -> Iterator[Raw]:
+        length, start, step = planes.walk
+        for number in range(numbers.start, min(numbers.stop, length), numbers.step):
+            plane = start + number * step
+            with lock:  # a file is read at one place at a time
+                yield Raw(number, _attempt(planes.read, plane), tags.time_s(number, plane))
+        if numbers.stop > length and planes.promised > length:
+            raise FrameError(length, f"{path.name} ends here, but more was promised: it is cut off or damaged")
+
+    length = None if planes.promised > planes.walk.length else planes.walk.length
+    return Medium(read, length, tags.fps, tags.um_per_px, planes.notes)
+
+
+def _attempt(read: Callable[[int], Pixels], plane: int) -> Pixels | str:
+    try:
+        return read(plane)
+    except Exception as error:  # whatever decoders stumble on in damaged data
+        return f"it cannot be read ({_reason(error)})"
+
+
+def _reason(error: Exception) -> str:
+    """An error of a library in one short line."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0][:_LONGEST_REASON]
+
+
+def _pages(tif: Any, path: Path, choice: Choice) -> _Planes:
+    """Every page is a frame."""
+    count, samples = len(tif.pages), _samples(tif.pages.first)
+    steps = walk(path.name, "IS", (count, samples), choice)
+
+    def read(plane: int) -> Pixels:
+        pixels = _page(tif.pages[plane // samples], path)
+        return pixels[..., plane % samples] if samples > 1 else pixels
+
+    return _Planes(read, steps, count + _goes_on(tif, steps.length))
+
+
+def _goes_on(tif: Any, length: int) -> int:
+    """1 if the last page that can be found tells of a next one, or the description of more, else 0."""
+    tif.filehandle.seek(tif.pages.next_page_offset or 0)
+    told = tif.imagej_metadata or {}
+    return int(any(tif.filehandle.read(tif.tiff.offsetsize)) or told.get("images", 0) > length)
+
+
+def _samples(page: Any) -> int:
+    """How many channels stand beside each other in a page: 1 if they are colours, or grey and its opacity."""
+    name, count = getattr(page.photometric, "name", ""), page.samplesperpixel
+    opacity = any(int(each) in (1, 2) for each in page.extrasamples)
+    return 1 if name not in ("MINISBLACK", "MINISWHITE") or (count == 2 and opacity) else count
+
+
+def _described(tif: Any, path: Path, choice: Choice) -> _Planes | None:
+    """The planes as the file describes them, None if it does not, or describes single pages only."""
+    if not any(getattr(tif, f"is_{kind}", False) for kind in _DESCRIBED):
+        return None
+    every = [each for each in tif.series if each.kind in _DESCRIBED]
+    if not every or (all(set(each.axes) <= set("YXS") for each in every) and every[0].kind != "ome"):
+        return None
+    positions = every if every[0].kind == "ome" else every[:1]
+    position = choice.position if choice.position in range(len(positions)) else 0
+    series, samples = positions[position], _samples(tif.pages.first)
+    outer = [(letter, size) for letter, size in zip(series.axes, series.shape, strict=True) if letter not in "YXS"]
+    axes, sizes = "P" + "".join(letter for letter, _ in outer) + "S", [len(positions), *(n for _, n in outer), samples]
+    loose = series.kind == "imagej" and not (tif.imagej_metadata or {}).get("hyperstack")
+    length, start, step = walk(path.name, axes, sizes, choice, loose=loose)
+    start -= position * math.prod(sizes[1:])
+    stacked = length > 1 and not set(series.axes) & set("TIQ")
+    notes = (f"{path.name}: its {length} slices, as ImageJ calls them, are taken for times",) if stacked else ()
+    return _Planes(_series_reader(series, path, samples), Walk(length, start, step), length, position, notes)
+
+
+def _series_reader(series: Any, path: Path, samples: int) -> Callable[[int], Pixels]:
+    """Reads the planes of a series by number; ``samples`` of them share a page."""
+    tif, keyframe = series.parent, series.keyframe
+    sizes = dict(zip(series.axes, series.shape, strict=True))
+    shape = [size for letter, size in sizes.items() if letter in "YXS"]
+    depth = max(math.prod(series.shape) // math.prod(shape) // len(series), 1)
+    offset = None if keyframe.photometric == tifffile.PHOTOMETRIC.PALETTE else series.dataoffset
+    dtype = np.dtype(series.dtype).newbyteorder(tif.byteorder)
+
+    def stored(plane: int) -> Pixels:
+        if offset is not None:
+            tif.filehandle.seek(offset + plane * math.prod(shape) * dtype.itemsize)
+            return _colours_last(tif.filehandle.read_array(dtype, math.prod(shape)).reshape(shape), series.axes)
+        page = series[plane // depth]
+        if page is None:
+            raise ValueError("its plane is not in the file")
+        pixels = _page(page, path)
+        return pixels[plane % depth] if depth > 1 else pixels
+
+    return stored if samples == 1 else lambda plane: stored(plane // samples)[..., plane % samples]
+
+
+def _colours_last(pixels: Pixels, axes: str) -> Pixels:
+    return np.moveaxis(pixels, -3, -1) if "S" in axes and not axes.endswith("S") else pixels
+
+
+def _page(page: Any, path: Path) -> Pixels:
+    """The pixels of one page as they are stored, palettes and colours of print turned to RGB. Raises ValueError, or
+    what a decoder stumbles on."""
+    keyframe, file = page.keyframe, page.parent.filehandle
+    check_size("it", keyframe.imagewidth, keyframe.imagelength * keyframe.imagedepth)
+    if isinstance(page, tifffile.TiffPage) and page.is_reduced:
+        raise ValueError("it is a reduced copy of another page")
+    ends = [start + size for start, size in zip(page.dataoffsets, page.databytecounts, strict=False)]
+    if not ends or 0 in page.databytecounts or max(ends) > file.size:
+        raise ValueError("parts of it are missing")
+    if getattr(keyframe.photometric, "name", "") in _MADE_RGB:
+        return _by_pillow(path, page.index)
+    try:
+        pixels = page.asarray(maxworkers=1)
+    except (NotImplementedError, ValueError) as error:
+        try:
+            return _by_pillow(path, page.index)
+        except Exception:
+            raise error from None  # what tifffile lacks, it names
+    pixels = _colours_last(pixels, keyframe.axes)
+    palette = keyframe.photometric == tifffile.PHOTOMETRIC.PALETTE and not page.parent.is_imagej
+    return np.moveaxis(keyframe.colormap >> 8, 0, -1).astype(np.uint8)[pixels] if palette else pixels
+
+
+def _by_pillow(path: Path, index: int) -> Pixels:
+    with warnings.catch_warnings(), Image.open(path) as image:
+        warnings.simplefilter("ignore")
+        image.seek(index)
+        plain = image.mode in ("1", "L", "LA", "RGB", "RGBA", "I", "F") or image.mode.startswith("I;16")
+        return np.array(image if plain else image.convert("RGB"))
