@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from torch_ecc.io.axes import Choice, check_single
 from torch_ecc.io.frames import Medium, Pixels, Raw, check_size
@@ -62,6 +62,8 @@ def _read_file(path: Path, number: int, choice: Choice) -> Raw:
             pixels, colours = _read_jpeg(path, "L"), lambda: _read_jpeg(path, "RGB")
         else:
             pixels = _read_image(path)
+    except UnidentifiedImageError:
+        return Raw(number, f"{path.name} cannot be read (it is damaged or not an image)", name=path.name)
     except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         return Raw(number, f"{path.name} cannot be read ({error})", name=path.name)
     return Raw(number, pixels, name=path.name, colours=colours)

@@ -55,7 +55,7 @@ def open_stack(stack: Stack, where: str) -> Medium:
 
 def _one(stack: Stack, layout: _Layout, number: int) -> Pixels | str:
     try:
-        array = np.array(stack[number])  # a copy: what is in memory may be changed while it is read
+        array = np.asarray(stack[number]).copy()  # what is in memory may be changed while it is read
     except Exception as error:  # whatever a lazy array stumbles on when it is computed
         return f"it cannot be read ({type(error).__name__}: {error})"
     return np.moveaxis(array, 0, -1) if layout.channels_first else array

@@ -71,8 +71,7 @@ def _ome(tif: Any, position: int) -> Tags | None:
     times = _ome_times(pixels)
     if times:
         return Tags(scale, _mean_rate(list(times.values())), lambda frame, plane: times.get(plane))
-    interval = told.get("TimeIncrement")
-    return Tags(scale, *_every(interval and float(interval) * _SECONDS[told.get("TimeIncrementUnit", "s")]))
+    return Tags(scale, *_every(float(told.get("TimeIncrement", 0)) * _SECONDS[told.get("TimeIncrementUnit", "s")]))
 
 
 def _ome_times(pixels: ET.Element) -> dict[int, float]:
@@ -105,7 +104,10 @@ def _micro_manager(tif: Any, _: int) -> Tags | None:
         return None
 
     def told(plane: int) -> dict[str, Any]:
-        tag = tif.pages[plane].tags.get(_MICRO_MANAGER)
+        try:
+            tag = tif.pages[plane].tags.get(_MICRO_MANAGER)
+        except Exception:  # the page is damaged, which its reading tells
+            return {}
         return tag.value if tag is not None and isinstance(tag.value, dict) else {}
 
     def time_s(frame: int, plane: int) -> float | None:

@@ -57,7 +57,8 @@ def open_tiff(path: Path, choice: Choice) -> Medium:
         for number in range(numbers.start, min(numbers.stop, length), numbers.step):
             plane = start + number * step
             with lock:  # a file is read at one place at a time
-                yield Raw(number, _attempt(planes.read, plane), tags.time_s(number, plane))
+                pixels, time_s = _attempt(planes.read, plane), tags.time_s(number, plane)
+            yield Raw(number, pixels, time_s)
         if numbers.stop > length and planes.promised > length:
             raise FrameError(length, f"{path.name} ends here, but more was promised: it is cut off or damaged")
 
@@ -92,9 +93,9 @@ def _pages(tif: Any, path: Path, choice: Choice) -> _Planes:
 
 def _goes_on(tif: Any, length: int) -> int:
     """1 if the last page that can be found tells of a next one, or the description of more, else 0."""
+    told, size = tif.imagej_metadata or {}, tif.tiff.offsetsize
     tif.filehandle.seek(tif.pages.next_page_offset or 0)
-    told = tif.imagej_metadata or {}
-    return int(any(tif.filehandle.read(tif.tiff.offsetsize)) or told.get("images", 0) > length)
+    return int(tif.filehandle.read(size) != bytes(size) or told.get("images", 0) > length)
 
 
 def _samples(page: Any) -> int:
@@ -112,7 +113,7 @@ def _described(tif: Any, path: Path, choice: Choice) -> _Planes | None:
     if not every or (all(set(each.axes) <= set("YXS") for each in every) and every[0].kind != "ome"):
         return None
     positions = every if every[0].kind == "ome" else every[:1]
-    position = choice.position if choice.position in range(len(positions)) else 0
+    position = min(max(choice.position or 0, 0), len(positions) - 1)
     series, samples = positions[position], _samples(tif.pages.first)
     outer = [(letter, size) for letter, size in zip(series.axes, series.shape, strict=True) if letter not in "YXS"]
     axes, sizes = "P" + "".join(letter for letter, _ in outer) + "S", [len(positions), *(n for _, n in outer), samples]

@@ -12,27 +12,10 @@ import numpy as np
 
 from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, check_size
 
-VIDEOS = frozenset(
-    {
-        *(".3gp", ".asf", ".avi", ".cine", ".dv", ".flv", ".h264", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg"),
-        *(
-            ".mkv",
-            ".mov",
-            ".mp4",
-            ".mpeg",
-            ".mpg",
-            ".mts",
-            ".mxf",
-            ".nut",
-            ".ogv",
-            ".ts",
-            ".vob",
-            ".webm",
-            ".wmv",
-            ".y4m",
-        ),
-    }
+_KINDS = (
+    "3gp asf avi cine dv flv h264 hevc ivf m2ts m4v mjpeg mjpg mkv mov mp4 mpeg mpg mts mxf nut ogv ts vob webm wmv y4m"
 )
+VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
 _SLACK_FRAMES, _SLACK = 3, 0.02
 _STRICT = {"err_detect": "explode"}  # a frame that is damaged is told, and not made up from its neighbours
 _PACKED = {"yuyv422": 0, "yvyu422": 0, "uyvy422": 1}  # where the first luma byte stands among chroma bytes
@@ -44,9 +27,7 @@ def open_video(path: Path) -> Medium:
     """The frames of a video file; ``length`` and ``fps`` as its container declares them. ValueError if it has none."""
     with _opened(path, _STRICT) as (container, stream):
         check_size(f"open_frames: {path}", stream.width, stream.height)
-        fps, length = _rate(container, stream), stream.frames
-        if not length and fps and container.duration:
-            length = round(container.duration / av.time_base * fps)
+        fps, length = _rate(container, stream), _declared(container, stream)
         ratio = stream.sample_aspect_ratio or 1
         first = next((frame for _, frame in _decoded(container, stream)), "")
     # Some writers never close an image as their standard wants it: a decoder that is strict would refuse every frame.
@@ -78,6 +59,12 @@ def _rate(container: Any, stream: Any) -> float | None:
     return float(rate) if rate and not container.format.flags & av.format.Flags.no_timestamps.value else None
 
 
+def _declared(container: Any, stream: Any) -> int:
+    """How many frames the container says it holds, 0 if it does not."""
+    fps = _rate(container, stream)
+    return stream.frames or (round(container.duration / av.time_base * fps) if fps and container.duration else 0)
+
+
 def _read(path: Path, options: dict[str, str], numbers: range) -> Iterator[Raw]:
     with _opened(path, options) as (container, stream):
         fps, count, last = _rate(container, stream), 0, 0.0
@@ -89,16 +76,18 @@ def _read(path: Path, options: dict[str, str], numbers: range) -> Iterator[Raw]:
                 yield _raw(count, frame, last if fps else None)
             count += 1
         # Counted in time and with some slack: what containers declare is exact for some and an estimate for others.
-        start = float((stream.start_time or 0) * (stream.time_base or 0))
-        missing = stream.frames - 1 - (last - start) * fps if fps and last > start else stream.frames - count
-        if missing > max(_SLACK_FRAMES, _SLACK * stream.frames) and stream.frames > count:
-            reason = f"{path.name} ends here, but declares {stream.frames} frames: it is cut off or damaged"
+        declared, start = _declared(container, stream), float((stream.start_time or 0) * (stream.time_base or 0))
+        missing = declared - 1 - (last - start) * fps if fps and last > start else declared - count
+        if missing > max(_SLACK_FRAMES, _SLACK * declared) and declared > count:
+            reason = f"{path.name} ends here, but declares {declared} frames: it is cut off or damaged"
             raise FrameError(count, reason)
 
 
 def _decoded(container: Any, stream: Any) -> Iterator[tuple[float | None, _Decoded]]:
-    """Time and frame, or the reason why it cannot be decoded, in the order of their times."""
+    """Time and frame, or the reason why there is none, in the order of their times. A damaged frame takes those with it
+    that are predicted from it, up to the next one that stands by itself."""
     damaged: list[tuple[float, str]] = []
+    tainted = False
     try:
         for packet in container.demux(stream):
             if packet.size == 0 and packet.dts is not None:
@@ -108,11 +97,13 @@ def _decoded(container: Any, stream: Any) -> Iterator[tuple[float | None, _Decod
             except av.FFmpegError as error:
                 time = packet.pts if packet.pts is not None else packet.dts
                 damaged.append((float((time or 0) * packet.time_base), f"it cannot be decoded ({error.strerror})"))
+                tainted = True
                 continue
             for frame in frames:
                 while damaged and frame.time is not None and damaged[0][0] < frame.time:
                     yield damaged.pop(0)
-                yield frame.time, "it is damaged" if frame.is_corrupt else frame
+                tainted = frame.is_corrupt or (tainted and not frame.key_frame)
+                yield frame.time, "it is damaged, or predicted from a frame that is" if tainted else frame
     except av.FFmpegError as error:
         damaged.append((damaged[-1][0] if damaged else 0.0, f"the file is damaged from here on ({error.strerror})"))
     yield from damaged
