@@ -466,7 +466,7 @@ def test_a_damaged_frame_of_a_video_is_told_and_passed_over(tmp_path, name, code
 @pytest.mark.parametrize(
     ("picture", "reason"),
     [
-        (None, r"frame 2: f2.png cannot be read \(it is damaged or not an image\)"),
+        (None, r"frame 2: f2.png cannot be read \(Truncated File Read\)"),
         (b"", r"frame 2: f2.png cannot be read \(it is empty\)"),
         (np.zeros((H, W + 1), np.uint8), rf"frame 2: f2.png is {W + 1} x {H} px, but f0.png is {W} x {H} px"),
         (np.zeros((H, W), np.uint16), "frame 2: f2.png is uint16, but f0.png is uint8"),

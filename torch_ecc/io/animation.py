@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, check_size
+from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_size
 
 ANIMATIONS = frozenset({".gif", ".apng"})
 
@@ -29,7 +29,7 @@ def open_animation(path: Path) -> Medium:
         with Image.open(path) as image:
             check_size(f"open_frames: {path}", *image.size)
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"open_frames: {path} cannot be read as an image ({error})") from error
+        raise ValueError(f"open_frames: {path} cannot be read as an image ({brief(error)})") from error
     return Medium(lambda numbers: _read(path, numbers), _length(path))
 
 
@@ -66,4 +66,4 @@ def _show(image: Image.Image, path: Path, number: int) -> tuple[Pixels, float] |
     except EOFError:
         return None
     except Exception as error:  # whatever the parsers stumble on; what follows is drawn over this frame
-        raise FrameError(number, f"{path.name} is damaged there ({error})") from error
+        raise FrameError(number, f"{path.name} is damaged there ({brief(error)})") from error

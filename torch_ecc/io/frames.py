@@ -151,6 +151,8 @@ class FrameSource:
         if isinstance(stored, str):
             return replace(frame, damage=stored)
         try:
+            if stored.ndim not in (2, 3) or 0 in stored.shape:
+                raise ValueError(f"is no picture, but of the shape {stored.shape}")
             pixels = _gray(_convert(stored))
         except ValueError as error:
             return replace(frame, damage=f"{raw.name or 'it'} {error}")
@@ -187,6 +189,7 @@ def _length(medium: Medium, numbers: range) -> int | None:
 
 
 MOST_PIXELS = 1 << 28  # of one frame: beyond it a header is a mistake or an attack
+_LONGEST = 160  # letters of an error
 
 
 def check_size(where: str, width: int, height: int) -> None:
@@ -194,6 +197,12 @@ def check_size(where: str, width: int, height: int) -> None:
     if width * height > MOST_PIXELS:
         most = f"{MOST_PIXELS >> 20} Mpx"
         raise ValueError(f"{where} claims {width} x {height} px; frames of up to {most} can be read")
+
+
+def brief(error: BaseException) -> str:
+    """The error of a library in one short line, by its name if it has no words."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0] if len(lines[0]) <= _LONGEST else f"{lines[0][:_LONGEST]} ..."
 
 
 def check_dtype(dtype: np.dtype[Any], where: str) -> None:

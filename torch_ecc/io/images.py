@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from torch_ecc.io.axes import Choice, check_single
-from torch_ecc.io.frames import Medium, Pixels, Raw, check_size
+from torch_ecc.io.frames import Medium, Pixels, Raw, brief, check_size
 from torch_ecc.io.tiff import TIFF, open_tiff
 
 IMAGES = TIFF | {".png", ".bmp", ".jpg", ".jpeg", ".jp2", ".webp", ".pgm", ".ppm", ".pnm"}
@@ -65,7 +65,7 @@ def _read_file(path: Path, number: int, choice: Choice) -> Raw:
     except UnidentifiedImageError:
         return Raw(number, f"{path.name} cannot be read (it is damaged or not an image)", name=path.name)
     except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
-        return Raw(number, f"{path.name} cannot be read ({error})", name=path.name)
+        return Raw(number, f"{path.name} cannot be read ({brief(error)})", name=path.name)
     return Raw(number, pixels, name=path.name, colours=colours)
 
 
@@ -89,12 +89,17 @@ def _read_jpeg(path: Path, mode: str) -> Pixels:
 
 
 def _read_image(path: Path) -> Pixels:
-    with Image.open(path) as image:  # the header only: OpenCV tells no size before it decodes
+    with Image.open(path) as image:  # its header, and the checksums of PNG: OpenCV tells neither before it decodes
         check_size("it", *image.size)
+        image.verify()
+    log = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
+    finally:
+        cv2.utils.logging.setLogLevel(log)
     if pixels is None:
         raise ValueError("it is damaged or not an image")
     return pixels if pixels.ndim == 2 or pixels.shape[2] < 3 else np.ascontiguousarray(pixels[:, :, 2::-1])

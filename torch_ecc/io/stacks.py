@@ -16,7 +16,7 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, check_dtype, check_size
+from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_dtype, check_size
 
 _SHAPES = "(F, H, W), (F, H, W, channels) or (F, channels, H, W) with 1, 3 or 4 channels"
 _DAMAGE = (OSError, EOFError, BadZipFile, zlib.error)
@@ -57,7 +57,7 @@ def _one(stack: Stack, layout: _Layout, number: int) -> Pixels | str:
     try:
         array = np.asarray(stack[number]).copy()  # what is in memory may be changed while it is read
     except Exception as error:  # whatever a lazy array stumbles on when it is computed
-        return f"it cannot be read ({type(error).__name__}: {error})"
+        return f"it cannot be read ({brief(error)})"
     return np.moveaxis(array, 0, -1) if layout.channels_first else array
 
 
@@ -72,7 +72,7 @@ def open_npz(path: Path) -> Medium:
         with ZipFile(path) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     except BadZipFile as error:
-        raise ValueError(f"open_frames: {path} cannot be read as .npz ({error})") from error
+        raise ValueError(f"open_frames: {path} cannot be read as .npz ({brief(error)})") from error
     if "frames" not in names and len(names) != 1:
         raise ValueError(f"open_frames: {path} must hold one array, or one named 'frames'; it holds {names}")
     key = "frames" if "frames" in names else names[0]
@@ -86,8 +86,11 @@ def _open_member(path: Path, key: str) -> Iterator[IO[bytes]]:
 
 
 def _medium(opener: _Opener, where: str) -> Medium:
-    with opener() as stream:
-        layout = _read_header(stream, where)
+    try:
+        with opener() as stream:
+            layout = _read_header(stream, where)
+    except _DAMAGE as error:
+        raise ValueError(f"open_frames: {where} cannot be read ({brief(error)})") from error
     return Medium(lambda numbers: _read(opener, layout, numbers), layout.frames)
 
 
@@ -96,7 +99,7 @@ def _read_header(stream: IO[bytes], where: str) -> _Layout:
     try:
         shape, fortran, dtype = read[np.lib.format.read_magic(stream)](stream)
     except Exception as error:  # its header is a Python expression, which can be wrong in every way
-        raise ValueError(f"open_frames: {where} cannot be read as a numpy array ({error})") from error
+        raise ValueError(f"open_frames: {where} cannot be read as a numpy array ({brief(error)})") from error
     if fortran and math.prod(shape) > 0:
         raise ValueError(f"open_frames: {where} is in Fortran order: save numpy.ascontiguousarray(frames) instead")
     return _layout(shape, dtype, where)._replace(offset=stream.tell())
@@ -121,7 +124,7 @@ def _read(opener: _Opener, layout: _Layout, numbers: range) -> Iterator[Raw]:
                 stream.seek(layout.offset + number * size)
                 done = stream.readinto(data)
             except _DAMAGE as error:
-                raise FrameError(number, f"the file is damaged ({error})") from error
+                raise FrameError(number, f"the file is damaged ({brief(error)})") from error
             if done < size:
                 raise FrameError(number, f"the file ends here, {layout.frames} frames were promised")
             array = data.view(layout.dtype).reshape(layout.shape)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ import tifffile
 from PIL import Image
 
 from torch_ecc.io.axes import Choice, Walk, walk
-from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, check_dtype, check_size
+from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_dtype, check_size
 from torch_ecc.io.tags import read_tags
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds wrong is said here, not on the screen
@@ -26,7 +27,6 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds
 TIFF = frozenset({".tif", ".tiff", ".btf", ".tf8", ".lsm", ".stk"})
 _DESCRIBED = ("shaped", "lsm", "mmstack", "ome", "imagej", "ndtiff", "fluoview", "stk", "scanimage", "nih")
 _MADE_RGB = ("SEPARATED", "CIELAB", "ICCLAB", "ITULAB")  # colours that tifffile leaves as they are
-_LONGEST_REASON = 160
 
 
 class _Planes(NamedTuple):
@@ -46,7 +46,7 @@ def open_tiff(path: Path, choice: Choice) -> Medium:
         tif: Any = tifffile.TiffFile(path)
         page = tif.pages.first
     except Exception as error:  # whatever a parser stumbles on in what is no TIFF
-        raise ValueError(f"open_frames: {path} cannot be read as TIFF ({_reason(error)})") from error
+        raise ValueError(f"open_frames: {path} cannot be read as TIFF ({brief(error)})") from error
     if page.dtype is not None:
         check_dtype(page.dtype, path.name)
     planes = _described(tif, path, choice) or _pages(tif, path, choice)
@@ -70,13 +70,7 @@ def _attempt(read: Callable[[int], Pixels], plane: int) -> Pixels | str:
     try:
         return read(plane)
     except Exception as error:  # whatever decoders stumble on in damaged data
-        return f"it cannot be read ({_reason(error)})"
-
-
-def _reason(error: Exception) -> str:
-    """An error of a library in one short line."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0][:_LONGEST_REASON]
+        return f"it cannot be read ({brief(error)})"
 
 
 def _pages(tif: Any, path: Path, choice: Choice) -> _Planes:
@@ -109,42 +103,75 @@ def _described(tif: Any, path: Path, choice: Choice) -> _Planes | None:
     """The planes as the file describes them, None if it does not, or describes single pages only."""
     if not any(getattr(tif, f"is_{kind}", False) for kind in _DESCRIBED):
         return None
-    every = [each for each in tif.series if each.kind in _DESCRIBED]
-    if not every or (all(set(each.axes) <= set("YXS") for each in every) and every[0].kind != "ome"):
+    try:
+        every = [each for each in tif.series if each.kind in _DESCRIBED]
+    except Exception as error:  # whatever the parsers stumble on in a damaged description
+        raise ValueError(f"open_frames: {path} is damaged: its axes cannot be made out ({brief(error)})") from error
+    if not every:
+        return _cut_off(tif, path, choice)
+    if all(set(each.axes) <= set("YXS") for each in every) and every[0].kind != "ome":
         return None
     positions = every if every[0].kind == "ome" else every[:1]
     position = min(max(choice.position or 0, 0), len(positions) - 1)
     series, samples = positions[position], _samples(tif.pages.first)
     outer = [(letter, size) for letter, size in zip(series.axes, series.shape, strict=True) if letter not in "YXS"]
     axes, sizes = "P" + "".join(letter for letter, _ in outer) + "S", [len(positions), *(n for _, n in outer), samples]
+    told = [int(n) for n in re.findall(r'Size[TZ]="([0-9]+)"', tif.ome_metadata or "")[:2]]  # C may be colours
+    if series.kind == "ome" and math.prod(sizes[1:]) < math.prod(told):
+        raise ValueError(f"open_frames: {path} is cut off or damaged: it describes {math.prod(told)} planes at least")
     loose = series.kind == "imagej" and not (tif.imagej_metadata or {}).get("hyperstack")
     length, start, step = walk(path.name, axes, sizes, choice, loose=loose)
     start -= position * math.prod(sizes[1:])
     stacked = length > 1 and not set(series.axes) & set("TIQ")
     notes = (f"{path.name}: its {length} slices, as ImageJ calls them, are taken for times",) if stacked else ()
-    return _Planes(_series_reader(series, path, samples), Walk(length, start, step), length, position, notes)
+    steps = Walk(length, start, step)
+    if series.dataoffset is not None and samples == 1 and position == 0 and len(series) < math.prod(sizes):
+        return _one_after_the_other(tif, tif.pages.first, steps)._replace(notes=notes)
+    return _Planes(_series_reader(series, path, samples), steps, length, position, notes)
+
+
+def _cut_off(tif: Any, path: Path, choice: Choice) -> _Planes | None:
+    """What is left of a file whose description does not fit what is there: the planes of ImageJ's stacks stand one
+    after the other. None if the description tells of nothing but times; ValueError if it does, and they do not."""
+    told, page = tif.imagej_metadata or {}, tif.pages.first
+    sizes = [max(int(told.get(name, 1)), 1) for name in ("frames", "slices", "channels")]
+    other = {*map(str, sizes[1:]), *re.findall(r'Size[CZ]="([0-9]+)"', tif.ome_metadata or "")}
+    if told and page.is_final and math.prod(sizes) > 1:
+        steps = walk(path.name, "TZC", sizes, choice, loose=not told.get("hyperstack"))
+        return _one_after_the_other(tif, page, steps)
+    if other == {"1"}:
+        return None
+    raise ValueError(f"open_frames: {path} is cut off or damaged: its axes cannot be made out")
+
+
+def _one_after_the_other(tif: Any, page: Any, steps: Walk) -> _Planes:
+    """Planes that follow the first one without a gap, as far as the file reaches."""
+    dtype, count = np.dtype(page.dtype).newbyteorder(tif.byteorder), math.prod(page.shape)
+    offset, size = page.dataoffsets[0], count * dtype.itemsize
+    there = (tif.filehandle.size - offset) // max(size, 1)
+    left = max(0, min(steps.length, -((steps.start - there) // max(steps.step, 1))))
+
+    def read(plane: int) -> Pixels:
+        tif.filehandle.seek(offset + plane * size)
+        return _colours_last(tif.filehandle.read_array(dtype, count).reshape(page.shape), page.axes)
+
+    return _Planes(read, steps._replace(length=left), steps.length)
 
 
 def _series_reader(series: Any, path: Path, samples: int) -> Callable[[int], Pixels]:
     """Reads the planes of a series by number; ``samples`` of them share a page."""
-    tif, keyframe = series.parent, series.keyframe
-    sizes = dict(zip(series.axes, series.shape, strict=True))
-    shape = [size for letter, size in sizes.items() if letter in "YXS"]
+    shape = [size for letter, size in zip(series.axes, series.shape, strict=True) if letter in "YXS"]
     depth = max(math.prod(series.shape) // math.prod(shape) // len(series), 1)
-    offset = None if keyframe.photometric == tifffile.PHOTOMETRIC.PALETTE else series.dataoffset
-    dtype = np.dtype(series.dtype).newbyteorder(tif.byteorder)
 
-    def stored(plane: int) -> Pixels:
-        if offset is not None:
-            tif.filehandle.seek(offset + plane * math.prod(shape) * dtype.itemsize)
-            return _colours_last(tif.filehandle.read_array(dtype, math.prod(shape)).reshape(shape), series.axes)
-        page = series[plane // depth]
+    def read(plane: int) -> Pixels:
+        page = series[plane // samples // depth]
         if page is None:
             raise ValueError("its plane is not in the file")
         pixels = _page(page, path)
-        return pixels[plane % depth] if depth > 1 else pixels
+        pixels = pixels[plane // samples % depth] if depth > 1 else pixels
+        return pixels[..., plane % samples] if samples > 1 else pixels
 
-    return stored if samples == 1 else lambda plane: stored(plane // samples)[..., plane % samples]
+    return read
 
 
 def _colours_last(pixels: Pixels, axes: str) -> Pixels:
@@ -166,6 +193,8 @@ def _page(page: Any, path: Path) -> Pixels:
     try:
         pixels = page.asarray(maxworkers=1)
     except (NotImplementedError, ValueError) as error:
+        if isinstance(error, ValueError) and "imagecodecs" not in str(error):
+            raise  # it is damaged: who is less strict would make something up
         try:
             return _by_pillow(path, page.index)
         except Exception:

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import av
 import numpy as np
 
-from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, check_size
+from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_size
 
 _KINDS = (
     "3gp asf avi cine dv flv h264 hevc ivf m2ts m4v mjpeg mjpg mkv mov mp4 mpeg mpg mts mxf nut ogv ts vob webm wmv y4m"
@@ -43,7 +43,7 @@ def _opened(path: Path, options: dict[str, str]) -> Iterator[tuple[Any, Any]]:
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
+        reason = getattr(error, "strerror", None) or brief(error)
         raise ValueError(f"open_frames: {path} cannot be opened as a video ({reason})") from error
     with container:
         stream = container.streams.best("video")
