@@ -119,6 +119,10 @@ def wrong(tmp_path) -> dict[str, tuple[list[str], str]]:
         )
     (tmp_path / "broken.mp4").write_bytes(b"no video at all" * 100)
     (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "nothing.tif").write_bytes(b"")
+    (tmp_path / "red\x1b[31m[bold]\n.tif").write_text("no TIFF")
+    (tmp_path / "deep.toml").write_text(f"centers = {5000 * '['}{5000 * ']'}")
+    (tmp_path / "long.toml").write_text(f"size = {5000 * '9'}")
     (tmp_path / "bad.toml").write_text("sise = 3\n")
     np.save(tmp_path / "line.npy", np.zeros(5))
     nan = stack().astype(np.float32)
@@ -126,6 +130,11 @@ def wrong(tmp_path) -> dict[str, tuple[list[str], str]]:
     np.save(tmp_path / "nan.npy", nan)
     return {
         "no input": ([], "INPUT is missing"),
+        "nothing in it": ([str(tmp_path / "nothing.tif"), *good[1:]], "nothing.tif is empty"),
+        "control codes": ([str(tmp_path / "red\x1b[31m[bold]\n.tif"), *good[1:]], r"red\x1b[31m[bold]\n.tif cannot be"),
+        "nested": (["--config", str(tmp_path / "deep.toml")], "deep.toml is not valid TOML: it is nested too deeply"),
+        "many digits": (["--config", str(tmp_path / "long.toml")], "long.toml is not valid TOML: Exceeds the limit"),
+        "huge size": ([*good[:-1], f"1{400 * '0'}"], "size must fit in the frame, got 1e+300 px or more"),
         "missing file": (["none.mp4", *good[1:]], "no such file"),
         "empty folder": ([str(tmp_path / "empty"), *good[1:]], "empty"),
         "no match": (["zzz*.png", *good[1:]], "no file matches"),
@@ -174,6 +183,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(video, tmp_path, monkeypatch
         assert caught.value.code == 2, name
         assert message in said, (name, said)
         assert "Traceback" not in said, name
+        assert len([line for line in said.splitlines() if line.startswith("torch-ecc")]) == 1, (name, said)
         if name != "mixed sizes":  # there the first frame was good, and is kept
             assert not out.exists(), name
         else:

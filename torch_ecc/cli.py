@@ -230,5 +230,12 @@ def main() -> None:
         Console(stderr=True).print("torch-ecc: stopped from the keyboard", style="red")
         sys.exit(INTERRUPTED)
     except (ValueError, OSError) as error:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"torch-ecc: {error}", style="red", markup=False)
+        Console(stderr=True, highlight=False, soft_wrap=True).print(
+            f"torch-ecc: {one_line(error)}", style="red", markup=False
+        )
         sys.exit(2)
+
+
+def one_line(error: BaseException) -> str:
+    """The words of an error with line ends and control codes, which names of files may hold, as escapes."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(error).strip())

@@ -32,7 +32,9 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise FileNotFoundError(f"config: no such file: {path}")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise ValueError(f"config: {path} is not valid TOML: it is nested too deeply") from error
+    except ValueError as error:  # also for bytes that are no text, and numbers of thousands of digits
         raise ValueError(f"config: {path} is not valid TOML: {error}") from error
 
 
