@@ -112,6 +112,8 @@ def _gaps(images: Sequence[Path]) -> tuple[str, ...]:
     if len(places) != 1 or len(images) < 3 or any("." in name[places[0]] for name in names):
         return ()
     k = places[0]
+    if len({(*name[:k], *name[k + 1 :]) for name in names}) > 1:
+        return ()
     numbers = [int(name[k]) for name in names]
     steps = Counter(b - a for a, b in pairwise(numbers))
     step = min(steps, key=lambda each: (-steps[each], each))

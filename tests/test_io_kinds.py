@@ -1,0 +1,285 @@
+"""Files as microscopes, machine-vision cameras and their programs write them: what is time, what is a level, what is
+neither. Every file shows the same six frames, unless it says otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import av
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from torch_ecc.io import open_frames
+
+Writer: TypeAlias = Callable[[Path], object]
+
+EVEN, UNEVEN = (0, 33, 67, 100, 133, 167), (0, 33, 67, 900, 1200, 1500)  # ms
+
+
+def speckle() -> np.ndarray:
+    """(6, 48, 70) uint16 of all levels, moving by (1.5, -0.75) px a frame."""
+    rng = np.random.default_rng(0)
+    places, widths, heights = rng.uniform(-10, 80, (150, 2)), rng.uniform(1, 2.5, 150), rng.uniform(2000, 12000, 150)
+    y, x = np.mgrid[:48, :70]
+    frames = []
+    for k in range(6):
+        squared = [(x - a - 1.5 * k) ** 2 + (y - b + 0.75 * k) ** 2 for a, b in places]
+        spots = zip(squared, widths, heights, strict=True)
+        frames.append(3000 + sum(height * np.exp(-far / (2 * width**2)) for far, width, height in spots))
+    return np.clip(frames, 0, 65535).astype(np.uint16)
+
+
+WIDE = speckle()
+NARROW = (WIDE >> 8).astype(np.uint8)
+
+
+class Kind(NamedTuple):
+    """What is written, what it shows to within ``loss`` levels and at which times in s, and what has to be chosen of it:
+    the names are what it is refused for."""
+
+    write: Writer
+    levels: np.ndarray
+    times: tuple[float, ...] | None = None
+    choice: dict[str, int] = {}  # noqa: RUF012 - nothing writes into it
+    loss: float = 0
+    um_per_px: float | None = None
+
+
+def tiff(data: np.ndarray, **options: Any) -> Writer:
+    return lambda path: tifffile.imwrite(path, data, **{"photometric": "minisblack"} | options)
+
+
+def turned(path: Path) -> None:
+    """With the tag by which a viewer turns pages by a quarter: the levels are as they are stored."""
+    with tifffile.TiffWriter(path) as writer:
+        for frame in NARROW:
+            writer.write(frame, photometric="minisblack", extratags=[(274, "H", 1, 6, True)], metadata=None)
+
+
+def video(frames: np.ndarray, pixel: str, codec: str, times_ms: tuple[int, ...], **options: str) -> Writer:
+    def write(path: Path) -> None:
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream(codec, rate=30, options=options)
+            stream.width, stream.height, stream.pix_fmt = 70, 48, pixel
+            stream.codec_context.time_base = stream.time_base = Fraction(1, 1000)
+            for time_ms, frame in zip(times_ms, frames, strict=True):
+                stored = av.VideoFrame.from_ndarray(frame, format="gray16le" if frame.dtype == np.uint16 else "gray")
+                image = stored.reformat(format=pixel, dst_color_range="JPEG" if pixel == "yuv420p" else None)
+                image.pts, image.time_base = time_ms, Fraction(1, 1000)
+                container.mux(stream.encode(image))
+            container.mux(stream.encode())
+
+    return write
+
+
+def animated(**options: Any) -> Writer:
+    first, *others = map(Image.fromarray, NARROW)
+    return lambda path: first.save(path, save_all=True, append_images=others, **options)
+
+
+def uncommon(delays_ms: tuple[int, ...]) -> tuple[float, ...]:
+    return tuple(sum(delays_ms[:k]) / 1000 for k in range(len(delays_ms)))
+
+
+def beside(*others: np.ndarray) -> np.ndarray:
+    return np.stack([WIDE, *others], 1)
+
+
+DELAYS = (50, 70, 10, 50, 200, 50)
+NEGATIVE = 65535 - WIDE[::-1]
+THREE = np.moveaxis(np.repeat(WIDE[..., None], 3, -1), -1, 1).copy()
+SECONDS, UNEVEN_SECONDS = tuple(t / 1000 for t in EVEN), tuple(t / 1000 for t in UNEVEN)
+OME = {"PhysicalSizeX": 275.0, "PhysicalSizeXUnit": "nm", "PhysicalSizeY": 0.3, "PhysicalSizeYUnit": "µm"}
+PLANES = {"DeltaT": [0.1 * k + 0.01 * c for k in range(6) for c in range(2)]}
+
+KINDS = {
+    "channels.tif": Kind(
+        tiff(beside(NEGATIVE), imagej=True, metadata={"axes": "TCYX"}), NEGATIVE, choice={"channel": 1}
+    ),
+    "slices.tif": Kind(
+        tiff(beside(NEGATIVE, NEGATIVE), imagej=True, metadata={"axes": "TZYX"}), WIDE, choice={"slice": 0}
+    ),
+    "channels.ome.tif": Kind(
+        tiff(beside(NEGATIVE), metadata={"axes": "TCYX", **OME, "Plane": PLANES}),
+        NEGATIVE,
+        tuple(0.1 * k + 0.01 for k in range(6)),
+        {"channel": 1},
+        um_per_px=0.275,
+    ),
+    "all.ome.tif": Kind(
+        tiff(
+            np.stack([beside(NEGATIVE), beside(WIDE)], 2),
+            metadata={"axes": "TCZYX", "TimeIncrement": 40.0, "TimeIncrementUnit": "ms"},
+        ),
+        WIDE,
+        tuple(0.04 * k for k in range(6)),
+        {"channel": 1, "slice": 1},
+    ),
+    "samples.tif": Kind(tiff(np.stack([WIDE, NEGATIVE], -1), planarconfig="contig"), NEGATIVE, choice={"channel": 1}),
+    "interval.tif": Kind(
+        tiff(
+            WIDE,
+            imagej=True,
+            resolution=(1 / 0.275, 1 / 0.275),
+            metadata={"axes": "TYX", "unit": "um", "finterval": 0.05},
+        ),
+        WIDE,
+        tuple(0.05 * k for k in range(6)),
+        um_per_px=0.275,
+    ),
+    "planar.tif": Kind(tiff(THREE, photometric="rgb", planarconfig="separate"), WIDE),
+    "signed.tif": Kind(tiff((NARROW.astype(np.int16) - 128).astype(np.int8)), NARROW.astype(float) - 128),
+    "half.tif": Kind(tiff((WIDE / 65535).astype(np.float16)), (WIDE / 65535).astype(np.float16)),
+    "wide.tif": Kind(tiff(WIDE.astype(">u4"), byteorder=">"), WIDE),
+    "jpeg2000.tif": Kind(tiff(NARROW, compression="jpeg2000"), NARROW),
+    "lzw.tif": Kind(tiff(WIDE, compression="lzw", predictor=True), WIDE),
+    "one_page.tif": Kind(tiff(NARROW, truncate=True), NARROW),
+    "turned.tif": Kind(turned, NARROW),
+    "deep.mkv": Kind(video(WIDE, "gray16le", "ffv1", EVEN), WIDE, SECONDS),
+    "twelve_bits.mkv": Kind(video(WIDE, "gray12le", "ffv1", EVEN), WIDE // 16, SECONDS, loss=1),
+    "uneven.mkv": Kind(video(NARROW, "gray", "ffv1", UNEVEN), NARROW, UNEVEN_SECONDS),
+    "uneven.mp4": Kind(video(NARROW, "yuv420p", "libx264", UNEVEN, crf="1"), NARROW, UNEVEN_SECONDS, loss=4),
+    "av1.mp4": Kind(video(NARROW, "yuv420p", "libsvtav1", EVEN, crf="5"), NARROW, SECONDS, loss=16),
+    "animated.png": Kind(animated(duration=DELAYS), NARROW, uncommon(DELAYS)),
+    "animated.webp": Kind(animated(duration=DELAYS, lossless=True), NARROW, uncommon(DELAYS)),
+    "animated.gif": Kind(animated(duration=DELAYS), NARROW, uncommon(DELAYS)),
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_kind_is_read_right(tmp_path, name):
+    kind, path = KINDS[name], tmp_path / name
+    if name in ("jpeg2000.tif", "lzw.tif"):
+        pytest.importorskip("imagecodecs")
+    if name == "av1.mp4" and "libsvtav1" not in av.codecs_available:
+        pytest.skip("no encoder of AV1")
+    kind.write(path)
+    source = open_frames(path, **kind.choice)
+    frames = list(source)
+    assert [frame.damage for frame in frames] == [None] * 6
+    found = np.stack([frame.pixels.numpy() for frame in frames]).astype(float)
+    assert np.abs(found - kind.levels.astype(float)).max() <= kind.loss
+    assert [frame.time_s for frame in frames] == (
+        [None] * 6 if kind.times is None else pytest.approx(kind.times, abs=1e-9)
+    )
+    assert source.timed == (kind.times is not None)
+    assert (source.um_per_px or (None,))[0] == pytest.approx(kind.um_per_px)
+
+
+@pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.choice])
+def test_what_is_no_time_is_refused_with_its_name(tmp_path, name):
+    kind, path = KINDS[name], tmp_path / name
+    kind.write(path)
+    with pytest.raises(ValueError, match="which are not time") as caught:
+        open_frames(path)
+    for axis in kind.choice:
+        assert f"2 {axis}s" in str(caught.value) or f"3 {axis}s" in str(caught.value)
+        assert f"--{axis} 0..." in str(caught.value)
+        with pytest.raises(ValueError, match=rf"{axis}: {name} holds [23] {axis}s, 0 to [12], got 7"):
+            open_frames(path, **kind.choice | {axis: 7})
+
+
+@pytest.mark.parametrize("name", ["animated.png", "deep.mkv", "turned.tif"])
+def test_a_choice_of_what_is_not_there_is_refused(tmp_path, name):
+    KINDS[name].write(tmp_path / name)
+    assert len(list(open_frames(tmp_path / name, channel=0))) == 6
+    with pytest.raises(ValueError, match=f"slice: {name} holds one slice, 0, got 2"):
+        open_frames(tmp_path / name, slice=2)
+
+
+def test_stage_positions_of_an_ome_file(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "s.ome.tif") as writer:
+        for frames in (WIDE, NEGATIVE, WIDE[:, ::-1]):
+            writer.write(frames, photometric="minisblack", metadata={"axes": "TYX"})
+    with pytest.raises(
+        ValueError, match=r"3 positions, which are not time \(P 3 x T 6\): choose with --position 0...2"
+    ):
+        open_frames(tmp_path / "s.ome.tif")
+    for position, frames in enumerate((WIDE, NEGATIVE, WIDE[:, ::-1])):
+        found = [frame.pixels.numpy() for frame in open_frames(tmp_path / "s.ome.tif", position=position)]
+        np.testing.assert_array_equal(found, frames)
+
+
+def test_slices_of_imagej_alone_are_taken_for_times_and_that_is_said(tmp_path):
+    """ImageJ calls every stack that is not told otherwise slices, that of a video too."""
+    tifffile.imwrite(
+        tmp_path / "s.tif",
+        WIDE,
+        photometric="minisblack",
+        metadata=None,
+        description="ImageJ=1.54f\nimages=6\nslices=6\n",
+    )
+    source = open_frames(tmp_path / "s.tif")
+    assert len(source) == 6
+    assert source.notes == ("s.tif: its 6 slices, as ImageJ calls them, are taken for times",)
+    tifffile.imwrite(tmp_path / "z.ome.tif", WIDE, photometric="minisblack", metadata={"axes": "ZYX"})
+    with pytest.raises(ValueError, match="6 slices, which are not time"):
+        open_frames(tmp_path / "z.ome.tif")
+
+
+def test_axes_without_names_are_refused(tmp_path):
+    tifffile.imwrite(tmp_path / "s.tif", beside(NEGATIVE), photometric="minisblack")
+    with pytest.raises(ValueError, match=r"axes of unknown meaning \(Q 6 x Q 2\): name them, one of them T"):
+        open_frames(tmp_path / "s.tif")
+
+
+# ---- folders -------------------------------------------------------------------------------------------------------
+
+
+def folder(path: Path, *names: str) -> Path:
+    path.mkdir()
+    for name, frame in zip(names, WIDE, strict=False):
+        assert cv2.imwrite(str(path / name), frame)
+    return path
+
+
+def test_a_folder_named_by_digits_is_a_folder(tmp_path, monkeypatch):
+    folder(tmp_path / "20240501", "f0.png", "f1.png")
+    monkeypatch.chdir(tmp_path)
+    np.testing.assert_array_equal([frame.pixels.numpy() for frame in open_frames("20240501")], WIDE[:2])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("t_0s.png", "t_0.5s.png", "t_1s.png", "t_1.5s.png", "t_10s.png"),
+        ("2024.5.1.png", "2024.5.2.png", "2024.5.10.png", "2024.10.1.png"),
+        ("a2.png", "A10.png", "b1.png"),
+        ("x²1.png", "x²2.png", "x²10.png"),
+    ],
+)
+def test_files_are_read_in_the_order_of_their_numbers(tmp_path, names):
+    source = open_frames(folder(tmp_path / "f", *names))
+    assert source.named
+    assert [frame.name for frame in source] == list(names)
+    np.testing.assert_array_equal([frame.pixels.numpy() for frame in source], WIDE[: len(names)])
+
+
+@pytest.mark.parametrize(
+    ("names", "missing"),
+    [
+        (("f001.png", "f002.png", "f006.png"), "f003 to f005"),
+        (("f00.png", "f10.png", "f20.png", "f40.png"), "f30"),
+        (("a_1_x.png", "a_2_x.png", "a_4_x.png", "a_7_x.png"), "a_3_x, a_5_x to a_6_x"),
+        (("f1.png", "f2.png", "f3.png"), None),
+        (("a1.png", "b7.png", "c9.png"), None),
+    ],
+)
+def test_gaps_in_the_numbering_are_told(tmp_path, names, missing):
+    notes = open_frames(folder(tmp_path / "f", *names)).notes
+    assert notes == (() if missing is None else (f"missing in the numbering of the files: {missing}",))
+
+
+def test_a_rate_given_wins_over_the_times_of_the_file(tmp_path):
+    KINDS["uneven.mkv"].write(tmp_path / "v.mkv")
+    source = open_frames(tmp_path / "v.mkv", fps=100.0)
+    assert source.fps == 100
+    assert [frame.time_s for frame in source] == pytest.approx([k / 100 for k in range(6)])
+    with pytest.raises(ValueError, match="fps must be a rate > 0 in Hz, got -1"):
+        open_frames(tmp_path / "v.mkv", fps=-1.0)
