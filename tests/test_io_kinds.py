@@ -40,8 +40,8 @@ NARROW = (WIDE >> 8).astype(np.uint8)
 
 
 class Kind(NamedTuple):
-    """What is written, what it shows to within ``loss`` levels, its times in s, and what has to be chosen of it: the names
-    are what it is refused for."""
+    """What is written, what it shows to within ``loss`` levels, its times in s, and what has to be chosen of it, by the
+    names of what it is refused for."""
 
     write: Writer
     levels: np.ndarray
