@@ -9,6 +9,7 @@ from pathlib import Path
 from torch_ecc.io.animation import ANIMATIONS, is_animated, open_animation
 from torch_ecc.io.axes import Choice, check_single
 from torch_ecc.io.camera import open_camera
+from torch_ecc.io.cine import open_cine
 from torch_ecc.io.frames import FrameSource, Medium
 from torch_ecc.io.images import IMAGES, open_images
 from torch_ecc.io.stacks import Stack, open_npy, open_npz, open_stack
@@ -18,6 +19,7 @@ from torch_ecc.io.video import VIDEOS, open_video
 _PLAIN = {
     ".npy": open_npy,
     ".npz": open_npz,
+    ".cine": open_cine,
     **dict.fromkeys(VIDEOS, open_video),
     **dict.fromkeys(ANIMATIONS, open_animation),
 }

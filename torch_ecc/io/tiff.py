@@ -10,10 +10,11 @@ import math
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import tifffile
 from PIL import Image
@@ -26,6 +27,8 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds
 
 TIFF = frozenset({".tif", ".tiff", ".btf", ".tf8", ".lsm", ".stk"})
 _DESCRIBED = ("shaped", "lsm", "mmstack", "ome", "imagej", "ndtiff", "fluoview", "stk", "scanimage", "nih")
+_JPEGS = (6, 7, 34892, 33007)  # which decode YCbCr by themselves
+_MOST_COPIES = 64  # pages of a file whose copies of a page are looked for: of pyramids and previews there are few
 _MADE_RGB = ("SEPARATED", "CIELAB", "ICCLAB", "ITULAB")  # colours that tifffile leaves as they are
 
 
@@ -74,15 +77,25 @@ def _attempt(read: Callable[[int], Pixels], plane: int) -> Pixels | str:
 
 
 def _pages(tif: Any, path: Path, choice: Choice) -> _Planes:
-    """Every page is a frame."""
-    count, samples = len(tif.pages), _samples(tif.pages.first)
-    steps = walk(path.name, "IS", (count, samples), choice)
+    """Every page is a frame, but for smaller copies of another page."""
+    every: Sequence[int] = range(len(tif.pages))
+    if len(every) <= _MOST_COPIES:
+        every = [k for k in every if k == 0 or not _is_copy(tif, k)]
+    samples = _samples(tif.pages.first)
+    steps = walk(path.name, "IS", (len(every), samples), choice)
 
     def read(plane: int) -> Pixels:
-        pixels = _page(tif.pages[plane // samples], path)
+        pixels = _page(tif.pages[every[plane // samples]], path)
         return pixels[..., plane % samples] if samples > 1 else pixels
 
-    return _Planes(read, steps, count + _goes_on(tif, steps.length))
+    return _Planes(read, steps, steps.length + _goes_on(tif, len(tif.pages)))
+
+
+def _is_copy(tif: Any, page: int) -> bool:
+    try:
+        return bool(tif.pages[page].is_reduced)
+    except Exception:  # it is damaged, which its reading tells
+        return False
 
 
 def _goes_on(tif: Any, length: int) -> int:
@@ -183,30 +196,34 @@ def _page(page: Any, path: Path) -> Pixels:
     what a decoder stumbles on."""
     keyframe, file = page.keyframe, page.parent.filehandle
     check_size("it", keyframe.imagewidth, keyframe.imagelength * keyframe.imagedepth)
-    if isinstance(page, tifffile.TiffPage) and page.is_reduced:
-        raise ValueError("it is a reduced copy of another page")
     ends = [start + size for start, size in zip(page.dataoffsets, page.databytecounts, strict=False)]
     if not ends or 0 in page.databytecounts or max(ends) > file.size:
         raise ValueError("parts of it are missing")
-    if getattr(keyframe.photometric, "name", "") in _MADE_RGB:
-        return _by_pillow(path, page.index)
+    colours = getattr(keyframe.photometric, "name", "")
+    if colours in _MADE_RGB or (colours == "YCBCR" and keyframe.compression not in _JPEGS):
+        return _by_another(path, page.index, f"its colours ({colours}) cannot be turned to RGB")
     try:
-        pixels = page.asarray(maxworkers=1)
+        pixels = _colours_last(page.asarray(maxworkers=1), keyframe.axes)
     except (NotImplementedError, ValueError) as error:
         if isinstance(error, ValueError) and "imagecodecs" not in str(error):
             raise  # it is damaged: who is less strict would make something up
-        try:
-            return _by_pillow(path, page.index)
-        except Exception:
-            raise error from None  # what tifffile lacks, it names
-    pixels = _colours_last(pixels, keyframe.axes)
-    palette = keyframe.photometric == tifffile.PHOTOMETRIC.PALETTE and not page.parent.is_imagej
-    return np.moveaxis(keyframe.colormap >> 8, 0, -1).astype(np.uint8)[pixels] if palette else pixels
+        return _by_another(path, page.index, brief(error))
+    if colours != "PALETTE" or page.parent.is_imagej or page.parent.is_ome:  # to these two a palette is for the eye
+        return pixels
+    return np.moveaxis(keyframe.colormap >> 8, 0, -1).astype(np.uint8)[pixels.astype(np.uint16)]
 
 
-def _by_pillow(path: Path, index: int) -> Pixels:
-    with warnings.catch_warnings(), Image.open(path) as image:
-        warnings.simplefilter("ignore")
-        image.seek(index)
-        plain = image.mode in ("1", "L", "LA", "RGB", "RGBA", "I", "F") or image.mode.startswith("I;16")
-        return np.array(image if plain else image.convert("RGB"))
+def _by_another(path: Path, index: int, reason: str) -> Pixels:
+    """A page read by Pillow, or else by OpenCV; ValueError with the ``reason`` why it came to that if neither can."""
+    try:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")
+            image.seek(index)
+            plain = image.mode in ("1", "L", "LA", "RGB", "RGBA", "I", "F") or image.mode.startswith("I;16")
+            return np.array(image if plain else image.convert("RGB"))
+    except Exception as error:  # whatever its parsers stumble on
+        read, pages = cv2.imreadmulti(str(path), index, 1, flags=cv2.IMREAD_UNCHANGED)
+        if not read:
+            raise ValueError(reason) from error
+        found: Pixels = pages[0]
+        return found if found.ndim == 2 else np.ascontiguousarray(found[..., 2::-1])

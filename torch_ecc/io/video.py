@@ -12,9 +12,7 @@ import numpy as np
 
 from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_size
 
-_KINDS = (
-    "3gp asf avi cine dv flv h264 hevc ivf m2ts m4v mjpeg mjpg mkv mov mp4 mpeg mpg mts mxf nut ogv ts vob webm wmv y4m"
-)
+_KINDS = "3gp asf avi dv flv h264 hevc ivf m2ts m4v mjpeg mjpg mkv mov mp4 mpeg mpg mts mxf nut ogv ts vob webm wmv y4m"
 VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
 _SLACK_FRAMES, _SLACK = 3, 0.02
 _STRICT = {"err_detect": "explode"}  # a frame that is damaged is told, and not made up from its neighbours
@@ -125,6 +123,8 @@ def _luma(frame: av.VideoFrame) -> Pixels | None:
     form, plane = frame.format, frame.planes[0]
     first, *others = form.components
     packed = _PACKED.get(form.name)
+    if plane.line_size < 0:  # the last row first: the conversion turns it over
+        return frame.to_ndarray() if not others else None
     plain = first.is_luma and not (form.has_palette or form.is_bit_stream or any(each.plane == 0 for each in others))
     if packed is None and not (plain and 8 <= first.bits <= 16):
         return None
