@@ -15,8 +15,6 @@ from torch_ecc.io.video import open_video
 
 # Mark, size, compression, version, first and count of the movie, first and count of this file, offsets of three parts.
 _HEADER = struct.Struct("<2s3HiIiI3I")
-    "<2s3HiIiI3I"
-)  # mark, size, compression, version, first movie image, ... offsets of three parts
 _BLOCK = struct.Struct("<I2H")  # size, with these eight bytes, kind, reserved
 _TIMES = 1002  # the kind of block that holds one time for each frame, and then the trigger's as in the header
 _UNIT = 2.0**-32  # s

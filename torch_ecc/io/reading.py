@@ -10,6 +10,7 @@ from torch_ecc.io.animation import ANIMATIONS, is_animated, open_animation
 from torch_ecc.io.axes import Choice, check_single
 from torch_ecc.io.camera import open_camera
 from torch_ecc.io.cine import open_cine
+from torch_ecc.io.extras import open_extra
 from torch_ecc.io.frames import FrameSource, Medium
 from torch_ecc.io.images import IMAGES, open_images
 from torch_ecc.io.stacks import Stack, open_npy, open_npz, open_stack
@@ -68,11 +69,14 @@ def _open(source: str | Path | int | Stack, choice: Choice) -> tuple[str, Medium
 
 
 def _open_path(path: Path, choice: Choice) -> Medium:
-    if path.is_dir():
-        return _open_folder(path, choice)
     suffix = path.suffix.lower()
+    if path.is_dir() and suffix != ".zarr":
+        return _open_folder(path, choice)
     if path.stat().st_size == 0:
         raise ValueError(f"open_frames: {path} is empty")
+    extra = open_extra(path, choice)
+    if extra is not None:
+        return extra
     if suffix in TIFF:
         return open_tiff(path, choice)
     if suffix in IMAGES and not is_animated(path):

@@ -210,7 +210,8 @@ def _page(page: Any, path: Path) -> Pixels:
         return _by_another(path, page.index, brief(error))
     if colours != "PALETTE" or page.parent.is_imagej or page.parent.is_ome:  # to these two a palette is for the eye
         return pixels
-    return np.moveaxis(keyframe.colormap >> 8, 0, -1).astype(np.uint8)[pixels.astype(np.uint16)]
+    palette: Pixels = np.moveaxis(keyframe.colormap >> 8, 0, -1).astype(np.uint8)
+    return palette[pixels.astype(np.uint16)]
 
 
 def _by_another(path: Path, index: int, reason: str) -> Pixels:
