@@ -246,7 +246,8 @@ def test_image_folders_and_globs(tmp_path, suffix, dtype, channels):
     codes = {0: None, 3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
     for index, frame in enumerate(frames):
         picture = frame if codes[channels] is None else cv2.cvtColor(frame, codes[channels])
-        assert cv2.imwrite(str(tmp_path / f"f{index}{suffix.upper() if index % 2 else suffix}"), picture)
+        raw = [cv2.IMWRITE_TIFF_COMPRESSION, 1]
+        assert cv2.imwrite(str(tmp_path / f"f{index}{suffix.upper() if index % 2 else suffix}"), picture, raw)
     (tmp_path / "notes.txt").write_text("not an image")
     (tmp_path / f"._f0{suffix}").write_text("not an image either")
     assert_same(open_frames(tmp_path), frames)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import tifffile
 from PIL import Image
@@ -201,30 +200,28 @@ def _page(page: Any, path: Path) -> Pixels:
         raise ValueError("parts of it are missing")
     colours = getattr(keyframe.photometric, "name", "")
     if colours in _MADE_RGB or (colours == "YCBCR" and keyframe.compression not in _JPEGS):
-        return _by_another(path, page.index, f"its colours ({colours}) cannot be turned to RGB")
+        return _by_pillow(path, page, f"its colours ({colours}) cannot be turned to RGB")
     try:
         pixels = _colours_last(page.asarray(maxworkers=1), keyframe.axes)
     except (NotImplementedError, ValueError) as error:
         if isinstance(error, ValueError) and "imagecodecs" not in str(error):
             raise  # it is damaged: who is less strict would make something up
-        return _by_another(path, page.index, brief(error))
+        return _by_pillow(path, page, f"{brief(error)}: pip install 'torch-ecc[codecs]'")
     if colours != "PALETTE" or page.parent.is_imagej or page.parent.is_ome:  # to these two a palette is for the eye
         return pixels
     palette: Pixels = np.moveaxis(keyframe.colormap >> 8, 0, -1).astype(np.uint8)
     return palette[pixels.astype(np.uint16)]
 
 
-def _by_another(path: Path, index: int, reason: str) -> Pixels:
-    """A page read by Pillow, or else by OpenCV; ValueError with the ``reason`` why it came to that if neither can."""
+def _by_pillow(path: Path, page: Any, reason: str) -> Pixels:
+    """A page read by Pillow; ValueError with the ``reason`` why it came to that if it cannot either, or not as deep."""
     try:
         with warnings.catch_warnings(), Image.open(path) as image:
             warnings.simplefilter("ignore")
-            image.seek(index)
+            image.seek(page.index)
             plain = image.mode in ("1", "L", "LA", "RGB", "RGBA", "I", "F") or image.mode.startswith("I;16")
+            if page.keyframe.bitspersample > 8 and image.mode not in ("I", "F") and not image.mode.startswith("I;16"):
+                raise ValueError("Pillow cuts colours down to eight bits")
             return np.array(image if plain else image.convert("RGB"))
     except Exception as error:  # whatever its parsers stumble on
-        read, pages = cv2.imreadmulti(str(path), index, 1, flags=cv2.IMREAD_UNCHANGED)
-        if not read:
-            raise ValueError(reason) from error
-        found: Pixels = pages[0]
-        return found if found.ndim == 2 else np.ascontiguousarray(found[..., 2::-1])
+        raise ValueError(reason) from error
