@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ecc.core.align import solve
-from torch_ecc.core.ambient import lasting, plain
+from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion
 from torch_ecc.core.estimate import Estimate, Origin, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
@@ -221,6 +221,10 @@ class Tracker(nn.Module):
 
         The frame is moved to the tracker's device. Raises ValueError for another shape, a wrong dtype, NaN.
         """
+        with threads_for(self.template.numel()):
+            return self._forward(frame)
+
+    def _forward(self, frame: Tensor) -> Estimate:
         state: Any = self._buffers  # a module's attributes are slow
         image = as_image("track", "frame", frame, state["pose"].device)
         if image.shape != self.frame_shape:
