@@ -32,9 +32,7 @@ def stabilise(
             f"stabilise: track must be (F, R, ...) with a template {template}, got {tuple(track.pose.shape)}"
         )
     motion = motion_since_start(track)[:, template]
-    return (
-        warped(frame, each, interpolation) for frame, each in zip(_pictures(frames), motion, strict=True)
-    )
+    return (warped(frame, each, interpolation) for frame, each in zip(_pictures(frames), motion, strict=True))
 
 
 def motion_since_start(track: Track) -> Tensor:
