@@ -15,7 +15,7 @@ from rich.progress import Task as RichTask
 from rich.text import Text
 
 from torch_ecc.commands.jobs import Align, CompareJob, TrackJob
-from torch_ecc.commands.options import given, options_of, read_polygons, read_size, track_toml, write_new
+from torch_ecc.commands.options import given, options_of, read_polygons, read_scale, read_size, track_toml, write_new
 from torch_ecc.config import fill, read_toml
 
 INTERRUPTED = 130
@@ -56,7 +56,8 @@ def demo(out: str, frames: int) -> None:
     TrackJob,
     without=("input",),
     centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
-    size={"type": str, "metavar": "N|WxH", "callback": read_size},
+    size={"type": str, "metavar": "N|H,W", "callback": read_size},
+    um_per_px={"type": str, "metavar": "S|SX,SY", "callback": read_scale},
     polygons={
         "flag": "--polygon",
         "type": str,
@@ -80,8 +81,10 @@ def track(config: str | None, write_config: str | None, **options: Any) -> None:
     from torch_ecc.commands.track import Session
 
     session = Session(fill(TrackJob, values, config or "track"))
+    for remark in session.remarks():
+        console.print(remark, soft_wrap=True, markup=False)
     with progress_bar(session.source.name, session.source.length) as advance:
-        finished = session.run(lambda estimate: advance())
+        finished = session.run(advance)
     _report(finished)
     if finished.interrupted:
         sys.exit(INTERRUPTED)
@@ -104,7 +107,7 @@ def simulate(config: str, out: str) -> None:
     x, y = template.center or (0.0, 0.0)
     h, w = template.size
     console.print(f"{len(sequence)} frames in {out}/. To track them:")
-    console.print(f"  torch-ecc track {out}/frames --center {x:g} {y:g} --size {w}x{h}", soft_wrap=True)
+    console.print(f"  torch-ecc track {out}/frames --center {x:g} {y:g} --size {h},{w}", soft_wrap=True)
 
 
 @app.command()
@@ -189,9 +192,17 @@ def _report(finished: Any) -> None:
             console.print(
                 f"Template {number} was not found in {lost} of {finished.frames} frames. Last frame: {sentence}"
             )
-    end = "Stopped from the keyboard after" if finished.interrupted else "Tracked"
-    names = ", ".join(sorted(path.name for path in finished.folder.iterdir())) if finished.frames else "nothing"
-    console.print(f"{end} {finished.frames} frames. In {finished.folder}/: {names}")
+    if finished.damaged:
+        console.print(f"{finished.damaged} of {finished.frames} frames are damaged: track.csv says which and why")
+    end = "Stopped after" if finished.interrupted else "Tracked"
+    names = (
+        ", ".join(sorted(path.name for path in finished.folder.iterdir() if path.suffix != ".part"))
+        if finished.frames
+        else "nothing"
+    )
+    console.print(f"{end} {finished.frames} frames. In {finished.folder}/: {names}", soft_wrap=True, markup=False)
+    if finished.interrupted and finished.frames:
+        console.print("The same command with --resume goes on from there.")
 
 
 class _Rate(ProgressColumn):

@@ -21,7 +21,8 @@ _Side: TypeAlias = Literal["above", "below", "right", "left", "tag"]
 
 
 class Mark(NamedTuple):
-    """A template in a frame: ``pose`` (3,), ``outlines`` (N, 2) from its centre, ``trail`` of (x, y), all in px."""
+    """A template in a frame: ``pose`` (3,), ``outlines`` (N, 2) from its centre, ``trail`` of (x, y), all in px; where
+    the scale is known, what it has ``moved`` (2,) in micrometres."""
 
     number: int
     pose: Tensor
@@ -29,6 +30,7 @@ class Mark(NamedTuple):
     word: str
     outlines: list[Tensor]
     trail: Collection[NDArray[np.float64]]
+    moved: NDArray[np.float64] | None = None
 
     @property
     def lost(self) -> bool:
@@ -58,7 +60,8 @@ class Mark(NamedTuple):
             return f"{self.number} LOST" if self.lost else str(self.number)
         if self.lost:
             return f"{self.number}   LOST{reason}\nlast at  x {x:.2f}   y {y:.2f}"
-        return f"{self.number}   x {x:.2f}   y {y:.2f}\nθ {np.degrees(theta):.3f}°   score {self.score:.3f}"
+        um = "" if self.moved is None else "\nΔx {:+.3f} µm   Δy {:+.3f} µm".format(*self.moved)
+        return f"{self.number}   x {x:.2f}   y {y:.2f}{um}\nθ {np.degrees(theta):.3f}°   score {self.score:.3f}"
 
 
 def draw(canvas: Canvas, mark: Mark) -> None:

@@ -19,6 +19,8 @@ CONVERGED: Final = "CONVERGED"
 DOUBTFUL: Final = "MAX_ITERATIONS"
 """The two words of a frame that carries a new pose. With every other word the template was lost in that frame and its
 pose is the last good one."""
+DAMAGED: Final = "DAMAGED"
+"""The word of a frame that could not be looked at."""
 
 
 class Record(Protocol):

@@ -245,14 +245,32 @@ class Tracker(nn.Module):
         """Same as calling the tracker."""
         return self(frame)  # type: ignore[no-any-return]
 
-    def track_sequence(self, frames: Iterable[Tensor]) -> Track:
+    @torch.no_grad()
+    def skip(self) -> Estimate:
+        """The record (R, ...) of a frame that cannot be looked at: the last good poses, and Status.DAMAGED."""
+        state: Any = self._buffers
+        state["tracked"].zero_()  # what comes next has made more than one step
+        pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
+        status, origin = (none.to(torch.int8) + int(code) for code in (Status.DAMAGED, Origin.TRACKED))
+        unknown = torch.diag_embed(torch.full_like(pose, torch.inf))
+        return Estimate(pose, pose - state["start"], none, status, none.long(), unknown, none.clone(), origin)
+
+    def track_sequence(self, frames: Iterable[Tensor | None], *, stop_at_damage: bool = False) -> Track:
         """Poses in every frame of a sequence: Track (F, R, ...).
 
-        Raises SequenceError, with the track so far, at the first frame that does not fit.
+        A frame that is missing (None), damaged (NaN) or of another size is Status.DAMAGED, and the track goes on; with
+        ``stop_at_damage`` it ends by SequenceError, with the track so far, and so it does where ``frames`` itself
+        raises a ValueError or brings something else than tensors.
         """
         estimates: list[Estimate] = []
         try:
-            estimates.extend(map(self.track, frames))
+            for frame in frames:
+                try:
+                    estimates.append(self.track(frame))  # type: ignore[arg-type]  # None is refused
+                except ValueError:
+                    if stop_at_damage or not (frame is None or isinstance(frame, Tensor)):
+                        raise
+                    estimates.append(self.skip())
         except ValueError as error:
             done = Track.stack(estimates) if estimates else None
             raise SequenceError(f"track_sequence: frame {len(estimates)}: {error}", done) from error
