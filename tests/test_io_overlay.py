@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -184,7 +185,7 @@ def test_video(tmp_path, size, fps):
     with OverlayWriter(tmp_path, shapes=[(121, 161)], status_names=NAMES, fps=fps) as writer:
         for k in range(6):
             writer.write(frame, found_at((320.0 + k, 240.0, 0.0)))
-            assert names(tmp_path) == {"overlay.part.mp4"}
+            assert names(tmp_path) <= {"overlay.h264.part"}
     assert names(tmp_path) == {"overlay.mp4"}
     assert writer.path == tmp_path / "overlay.mp4"
     source = open_frames(writer.path)
@@ -194,15 +195,7 @@ def test_video(tmp_path, size, fps):
 
 
 def test_frames_where_no_video_can_be_written(tmp_path, monkeypatch):
-    class NoCodec:
-        fourcc = cv2.VideoWriter.fourcc
-
-        def __init__(self, *_: object) -> None: ...
-
-        def isOpened(self) -> bool:
-            return False
-
-    monkeypatch.setattr(cv2, "VideoWriter", NoCodec)
+    monkeypatch.setattr(av, "codecs_available", {"png"})
     with OverlayWriter(tmp_path, shapes=[(121, 161)], status_names=NAMES) as writer:
         writer.write(GREY, found_at((320.0, 240.0, 0.0)))
     assert writer.path == tmp_path / "overlay"

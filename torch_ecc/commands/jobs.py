@@ -10,7 +10,6 @@ from typing import Any
 
 from torch_ecc.core.criteria import CRITERIA, ILLUMINATION
 from torch_ecc.core.settings import Settings, described
-from torch_ecc.io.output import check_folder
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.track.tracker import PREDICTIONS
 
@@ -108,7 +107,7 @@ class TrackJob(Tracking):
     def folder(self) -> Path:
         """Where the results go."""
         if self.out is not None:
-            return check_folder(self.out, "track")
+            return Path(self.out).expanduser()
         given = Path(self.input.strip()).expanduser()
         told = given.resolve().name if given.is_dir() else given.stem
         plain = re.sub(r"[^\w.-]+", "-", told).strip("-.") or given.parent.name or "frames"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
@@ -21,7 +22,7 @@ from torch_ecc.core.estimate import Status
 from torch_ecc.io import Frame, OverlayWriter, TrackWriter, open_frames
 from torch_ecc.io.beside import ahead
 from torch_ecc.io.journal import Unfinished
-from torch_ecc.io.output import claim
+from torch_ecc.io.output import check_folder, claim
 from torch_ecc.io.stabilised import StabilisedWriter
 from torch_ecc.io.summary import plain
 from torch_ecc.io.track import FILES
@@ -41,8 +42,8 @@ class Finished(NamedTuple):
 
     frames: int
     damaged: int
-    lost: Tensor
-    last_status: Tensor
+    lost: NDArray[np.int64]
+    last_status: NDArray[np.int8]
     folder: Path
     interrupted: bool
 
@@ -54,7 +55,7 @@ class Session:
     """
 
     def __init__(self, job: TrackJob) -> None:
-        self.job, self.folder = job, job.folder()
+        self.job, self.folder = job, check_folder(job.folder(), "track")
         if not (job.force or job.resume):
             refuse_overwriting(self.folder, RESULTS)
         crops = read_templates(job)
@@ -112,6 +113,8 @@ class Session:
                         progress(run.done)
             except (KeyboardInterrupt, ValueError) as error:
                 stopped = error
+            except OSError as error:
+                raise _told(error, run.done) from error
             if run.done:
                 self._plot()
             if isinstance(stopped, ValueError):
@@ -182,9 +185,12 @@ class _Run:
     def __init__(self, tracker: Tracker, track: TrackWriter, films: list[Pictures], *, stop_at_damage: bool) -> None:
         self.tracker, self.track, self.films, self.stop_at_damage = tracker, track, films, stop_at_damage
         self.done, self.damaged = 0, 0
-        self.lost, self.last = (torch.zeros(len(tracker.start), dtype=torch.int64) for _ in range(2))
+        self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
         # What the next frame depends on: all of it goes into the journal with every frame.
         self._state = [part for name, part in tracker.named_buffers() if name not in CONSTANT]
+        self._views = [part.numpy() for part in self._state if part.device.type == "cpu"]  # they see what is written
+        for film in films:
+            film.film.resumable = True
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
@@ -205,18 +211,19 @@ class _Run:
             if self.stop_at_damage:
                 raise ValueError(f"frame {frame.number}: {error}") from error
             frame, estimate = dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
-        self.track.write(estimate, frame, b"".join(part.cpu().numpy().tobytes() for part in self._state))
+        views = self._views or [part.cpu().numpy() for part in self._state]
+        self.track.write(estimate, frame, b"".join(view.tobytes() for view in views))
         for film in self.films:
             film.write(frame, estimate)
-        self._count(estimate.status.cpu().long()[None])
+        self._count(estimate.status.cpu().numpy()[None])
 
-    def _count(self, status: Tensor) -> None:
+    def _count(self, status: NDArray[np.int8]) -> None:
         """Frames more with ``status`` (F, R)."""
-        damaged = status == Status.DAMAGED
-        self.done += len(status)
-        self.damaged += int(damaged[:, 0].sum())
-        self.lost += (~Status.good(status) & ~damaged).sum(0)
-        self.last = status[-1]
+        self.done, self.last = self.done + len(status), status[-1]
+        if status.max() > Status.MAX_ITERATIONS:
+            damaged = status == Status.DAMAGED
+            self.damaged += int(damaged[:, 0].sum())
+            self.lost += ((status > Status.MAX_ITERATIONS) & ~damaged).sum(0)
 
     def go_on(self, records: NDArray[Any]) -> None:
         """After the ``records`` (F,) of an unfinished run."""
@@ -226,10 +233,18 @@ class _Run:
             value = np.frombuffer(state[:size], part.cpu().numpy().dtype).reshape(tuple(part.shape))
             part.copy_(torch.from_numpy(value.copy()))
             state = state[size:]
-        status = torch.from_numpy(np.array(records["status"])).long()
+        status = np.array(records["status"])
         for film in self.films:
-            film.go_on(np.array(records["pose"]), Status.good(status).numpy())
+            film.go_on(np.array(records["pose"]), status <= Status.MAX_ITERATIONS)
         self._count(status)
+
+
+def _told(error: OSError, done: int) -> OSError:
+    """The same of a full disk, with what to do."""
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not done:
+        return error
+    words = f"{error.strerror}. {done} frames are done: with some room, the same command with --resume goes on"
+    return OSError(error.errno, words)
 
 
 def settings_of(job: TrackJob, first: Tensor) -> dict[str, Any]:

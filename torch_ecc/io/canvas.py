@@ -6,7 +6,7 @@ Everything is given in frame pixels and sized to the picture, so that it reads t
 from __future__ import annotations
 
 from functools import cache
-from math import ceil
+from math import ceil, floor
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -58,8 +58,9 @@ class Stretch(NamedTuple):
         """(H, W) or (C, H, W) -> (H, W, 3) in OpenCV's order."""
         pixels = frame.detach().cpu().numpy()
         if pixels.dtype != np.uint8:
-            scaled = (pixels.astype(np.float32) - self.low) * (255.0 / (self.high - self.low))
-            pixels = np.nan_to_num(scaled).clip(0, 255).round().astype(np.uint8)
+            scale = 255.0 / (self.high - self.low)
+            above = np.fmax(pixels, np.asarray(self.low).astype(pixels.dtype))  # of NaN and a number the number
+            pixels = cv2.convertScaleAbs(above, alpha=scale, beta=-self.low * scale)
         planes = (
             [pixels] * 3 if pixels.ndim == 2 else [pixels[k] for k in ((2, 1, 0) if len(pixels) == 3 else (0,) * 3)]
         )
@@ -80,6 +81,7 @@ class Canvas:
         self.scale = max(1.0, shortest * self._zoom / 480)
         self.gap = round(3 * self.scale)
         self.step = self.scale / self._zoom
+        self._size: int = round(12.5 * self.scale)  # of letters
 
     def place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Frame pixels to canvas pixels, (..., 2): both count from the middle of their first pixel."""
@@ -97,7 +99,7 @@ class Canvas:
     def measure(self, text: str) -> tuple[int, int]:
         """Width and height in canvas px of the label that ``text`` makes."""
         lines = text.split("\n")
-        width = max(sum(_glyph(self._size, letter).shape[1] for letter in line) for line in lines)
+        width = max(sum(_width(self._size, letter) for letter in line) for line in lines)
         return width + 4 * self.gap, len(lines) * (_height(self._size) + self.gap) + self.gap
 
     def clamp(self, box: Box) -> Box:
@@ -120,11 +122,6 @@ class Canvas:
             under[:] = under + ink * (tint - under)
         ground[:, : self.gap] = colour
 
-    @property
-    def _size(self) -> int:
-        size: int = round(12.5 * self.scale)
-        return size
-
 
 @cache
 def _load_font(size: int) -> ImageFont.FreeTypeFont:
@@ -138,11 +135,24 @@ def _load_font(size: int) -> ImageFont.FreeTypeFont:
 def _glyph(size: int, letter: str) -> NDArray[np.float32]:
     """How much ink a letter leaves where, (h, w, 1) in [0, 1]: drawn once, since labels change in every frame."""
     font = _load_font(size)
-    ink = Image.new("L", (max(round(font.getlength(letter)), 1), _height(size)))
-    ImageDraw.Draw(ink).text((0, 0), letter, 255, font)
+    ink = Image.new("L", (_width(size, letter), _height(size)))
+    ImageDraw.Draw(ink).text((0, -_top(size)), letter, 255, font)
     return np.asarray(ink, np.float32)[..., None] / np.float32(255)
 
 
 @cache
+def _width(size: int, letter: str) -> int:
+    return max(round(_load_font(size).getlength(letter)), 1)
+
+
+@cache
 def _height(size: int) -> int:
-    return sum(_load_font(size).getmetrics())
+    return ceil(_load_font(size).getbbox(_TALLEST)[3]) - _top(size)
+
+
+@cache
+def _top(size: int) -> int:
+    return floor(_load_font(size).getbbox(_TALLEST)[1])
+
+
+_TALLEST = "Δθy("

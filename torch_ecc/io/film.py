@@ -17,11 +17,13 @@ Picture = NDArray[np.uint8]
 
 class Film:
     """``add`` pictures, and find ``name``.mp4 (or the folder ``name``, if ``as_frames``) in ``folder``, at ``fps`` in
-    Hz, 25 if None. Nothing is created before the first one."""
+    Hz, 25 if None. Nothing is created before the first one. ``resumable``: keep what a later run can go on with, if
+    this one ends before its time."""
 
     def __init__(self, folder: str | Path, name: str, fps: float | None = None, *, as_frames: bool = False) -> None:
         self.folder, self.name = check_folder(folder, "OverlayWriter"), name
         self._fps, self._as_frames, self._kept = fps, as_frames, 0
+        self.resumable = False
         self._behind = Behind()
         self._sink: Sink | None = None
 
@@ -48,4 +50,4 @@ class Film:
         self._behind.finish()
         if self._sink is None and self._kept:
             self._sink = open_sink(self.folder, self.name, self._fps, self._kept, as_frames=self._as_frames)
-        return self._sink.close(whole=whole) if self._sink else None
+        return self._sink.close(keep=self.resumable and not whole) if self._sink else None

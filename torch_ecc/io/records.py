@@ -62,7 +62,7 @@ def to_arrays(record: Record) -> dict[str, NDArray[Any]]:
         value: Tensor = getattr(record, name)
         if tuple(value.shape) != (count, *tail):
             raise ValueError(f"write: record.{name} must be {(count, *tail)}, got {tuple(value.shape)}")
-        arrays[name] = value.detach().cpu().numpy().astype(dtype)
+        arrays[name] = (value if value.device.type == "cpu" else value.cpu()).detach().numpy().astype(dtype)
     return arrays
 
 

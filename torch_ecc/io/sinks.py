@@ -24,7 +24,7 @@ _FPS = 25.0
 _LOWEST, _HIGHEST = 0.1, 1000.0  # what players know
 _CODEC, _STREAM = "libx264", "h264"
 # Fast rather than small: the encoder must not take longer than the tracker. A key picture every 50, to jump to.
-_OPTIONS = {"preset": "ultrafast", "crf": "26", "tune": "zerolatency", "g": "50"}
+_OPTIONS = {"preset": "ultrafast", "crf": "28", "tune": "zerolatency", "g": "50"}
 
 
 class Sink(Protocol):
@@ -32,8 +32,8 @@ class Sink(Protocol):
 
     def write(self, picture: NDArray[np.uint8]) -> None: ...
 
-    def close(self, *, whole: bool) -> Path:
-        """Finish, give the result its final name, and return that. If it is not ``whole``, a later run can go on."""
+    def close(self, *, keep: bool) -> Path:
+        """Finish, give the result its final name, and return that; ``keep`` what a later run can go on with."""
 
 
 def open_sink(folder: Path, name: str, fps: float | None, kept: int, *, as_frames: bool) -> Sink:
@@ -90,7 +90,7 @@ class _Video:
         for packet in packets:
             append(self._file, bytes(packet))
 
-    def close(self, *, whole: bool) -> Path:
+    def close(self, *, keep: bool) -> Path:
         self._append(self._encoder.encode() if self._encoder else [])
         self._file.close()
         film, stream = f"{self._name}.mp4", part(self._folder, f"{self._name}.{_STREAM}")
@@ -100,7 +100,7 @@ class _Video:
             part(self._folder, film).unlink(missing_ok=True)
             raise
         publish(self._folder, film)
-        if whole:
+        if not keep:
             stream.unlink()
         return self._folder / film
 
@@ -134,9 +134,9 @@ class _Frames:
             append(file, cv2.imencode(".png", picture)[1].tobytes())
         self._count += 1
 
-    def close(self, *, whole: bool) -> Path:
+    def close(self, *, keep: bool) -> Path:
         """Frames of an earlier run are replaced; other files in that folder stay."""
-        if not whole:
+        if keep:
             return self._part
         self._path.mkdir(exist_ok=True)
         for file in self._path.glob("frame_*.png"):

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -34,10 +35,10 @@ class TrackWriter:
     ``um_matrix`` (2, 2), which takes a displacement (dx, dy) in px to micrometres, adds the columns dx_um and dy_um;
     ``settings`` goes into summary.json. ``unfinished``: what a run before has left, to go on with.
 
-    A run that ends by an exception keeps the frames that it had: summary.json says ``"complete": false`` and why, and
-    ``.part`` files stay that a later run can go on with. So do those of a process that is killed, or whose disk is
-    full; they have every frame that was written. Nothing is created before the first record. Results of an earlier run
-    in the same folder stay until then and are replaced at the end.
+    A run that ends by an exception keeps the frames that it had: summary.json says ``"complete": false`` and why, and,
+    where there is a state, a ``.part`` file stays that a later run can go on with. So do those of a process that is
+    killed, or whose disk is full; they have every frame that was written. Nothing is created before the first record.
+    Results of an earlier run in the same folder stay until then and are replaced at the end.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class TrackWriter:
         seconds = time.perf_counter() - self._started
         records = journal.records()
         fields: dict[str, Any] = {name: records[name] for name in journal.fields} | self._constants()
-        with create(part(self.out_dir, "track.npz")) as file:
+        with BufferedWriter(create(part(self.out_dir, "track.npz"))) as file:
             np.savez(file, **fields)  # copied through a small buffer
         summary = summarise(records, self.status_names, error)
         rate = (journal.frames - self._before) / seconds
@@ -114,7 +115,7 @@ class TrackWriter:
         # The old summary goes first and the new one comes last: a summary always belongs to the files beside it.
         (self.out_dir / "summary.json").unlink(missing_ok=True)
         publish(self.out_dir, *FILES)
-        if error is None:
+        if error is None or not journal.form.state:
             journal.remove()
 
     def _constants(self) -> dict[str, NDArray[Any]]:
