@@ -130,7 +130,7 @@ class Session:
             raise ValueError(
                 f"out: {self.folder} holds an unfinished run: --resume goes on with it, --force starts anew"
             )
-        for name in left.settings.keys() | self.settings.keys():
+        for name in left.settings | self.settings:
             before, now = left.settings.get(name), self.settings.get(name)
             if before != now:
                 raise ValueError(f"resume: {name} was {before!r} in the run in {self.folder}, and is {now!r} now")

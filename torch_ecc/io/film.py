@@ -47,7 +47,12 @@ class Film:
 
     def close(self, *, whole: bool) -> Path | None:
         """All that was added is written: where it is, None if there is nothing."""
-        self._behind.finish()
+        try:
+            self._behind.finish()
+        except BaseException:
+            if self._sink is not None:
+                self._sink.leave()
+            raise
         if self._sink is None and self._kept:
             self._sink = open_sink(self.folder, self.name, self._fps, self._kept, as_frames=self._as_frames)
         return self._sink.close(keep=self.resumable and not whole) if self._sink else None

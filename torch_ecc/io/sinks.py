@@ -35,6 +35,9 @@ class Sink(Protocol):
     def close(self, *, keep: bool) -> Path:
         """Finish, give the result its final name, and return that; ``keep`` what a later run can go on with."""
 
+    def leave(self) -> None:
+        """Close what is open, and leave it as it is."""
+
 
 def open_sink(folder: Path, name: str, fps: float | None, kept: int, *, as_frames: bool) -> Sink:
     """The video ``name``.mp4, or PNG frames in the folder ``name`` if asked for or if no video can be written here,
@@ -91,8 +94,8 @@ class _Video:
             append(self._file, bytes(packet))
 
     def close(self, *, keep: bool) -> Path:
-        self._append(self._encoder.encode() if self._encoder else [])
-        self._file.close()
+        with self._file:
+            self._append(self._encoder.encode() if self._encoder else [])
         film, stream = f"{self._name}.mp4", part(self._folder, f"{self._name}.{_STREAM}")
         try:
             self._contain(stream, part(self._folder, film))
@@ -103,6 +106,9 @@ class _Video:
         if not keep:
             stream.unlink()
         return self._folder / film
+
+    def leave(self) -> None:
+        self._file.close()
 
     def _contain(self, stream: Path, film: Path) -> None:
         """The same pictures in a container, whose index comes first, so that it plays while it loads."""
@@ -145,3 +151,6 @@ class _Frames:
             os.replace(file, self._path / file.name)
         self._part.rmdir()
         return self._path
+
+    def leave(self) -> None:
+        """Nothing is open."""
