@@ -36,13 +36,18 @@ class Behind:
     def do(self, call: Callable[[], None]) -> None:
         """Have ``call`` made after all those before it."""
         while self._waiting and (self._waiting[0].done() or len(self._waiting) >= _BEHIND):
-            self._waiting.popleft().result()
+            self._settle()
         self._waiting.append(self._thread.submit(call))
 
     def finish(self) -> None:
         """Wait for all calls; the first error is raised, and what comes after it is not called."""
         try:
             while self._waiting:
-                self._waiting.popleft().result()
+                self._settle()
         finally:
             self._thread.shutdown(cancel_futures=True)
+
+    def _settle(self) -> None:
+        """The oldest call: if it has failed it stays, and so do all that would come after it."""
+        self._waiting[0].result()
+        self._waiting.popleft()

@@ -31,21 +31,26 @@ def stabilise(
         raise ValueError(
             f"stabilise: track must be (F, R, ...) with a template {template}, got {tuple(track.pose.shape)}"
         )
-    motion = motion_since_start(track)[:, template]
-    return (warped(frame, each, interpolation) for frame, each in zip(_pictures(frames), motion, strict=True))
+    return _stabilised(frames, motion_since_start(track)[:, template], interpolation)
+
+
+def _stabilised(frames: Iterable[Tensor], motion: Tensor, interpolation: str) -> Iterator[Tensor]:
+    done = 0
+    for frame in frames:
+        if require_tensor("stabilise", "frame", frame).dim() not in (2, 3):
+            raise ValueError(f"stabilise: frame {done} must be (H, W) or (C, H, W), got {tuple(frame.shape)}")
+        if done == len(motion):
+            raise ValueError(f"stabilise: frames must be {done}, as many as the track has, got more")
+        yield warped(frame, motion[done], interpolation)
+        done += 1
+    if done < len(motion):
+        raise ValueError(f"stabilise: frames must be {len(motion)}, as many as the track has, got {done}")
 
 
 def motion_since_start(track: Track) -> Tensor:
     """The rigid motions (F, R, 3) of the frame that take what was seen at the start to where it is: W(p) o W(start)^-1
     as poses of the frame's own origin."""
     return compose(track.pose, inverse(track.pose - track.displacement))
-
-
-def _pictures(frames: Iterable[Tensor]) -> Iterator[Tensor]:
-    for number, frame in enumerate(frames):
-        if require_tensor("stabilise", "frame", frame).dim() not in (2, 3):
-            raise ValueError(f"stabilise: frame {number} must be (H, W) or (C, H, W), got {tuple(frame.shape)}")
-        yield frame
 
 
 @plain
