@@ -40,6 +40,8 @@ class Record(Protocol):
     def covariance(self) -> Tensor: ...  # (R, 3, 3)
     @property
     def residual_rms(self) -> Tensor: ...  # (R,)
+    @property
+    def coverage(self) -> Tensor: ...  # (R,)
 
 
 FIELDS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
@@ -50,6 +52,7 @@ FIELDS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
     "iterations": ("i4", ()),
     "covariance": ("f8", (3, 3)),
     "residual_rms": ("f8", ()),
+    "coverage": ("f8", ()),
 }
 """dtype and shape of each field per template."""
 

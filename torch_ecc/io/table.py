@@ -27,7 +27,8 @@ def _columns(*, timed: bool, named: bool, micrometres: bool) -> dict[str, str]:
         | {f"d{name}": number for name, number in pose.items()}
         | ({"dx_um": _XY, "dy_um": _XY} if micrometres else {})
         | {f"sigma_{name}": _SHORT for name in pose}
-        | {"score": "%.6f", "status": "%s", "iterations": "%d", "residual_rms": _SHORT, "damage": "%s"}
+        | {"score": "%.6f", "status": "%s", "iterations": "%d", "residual_rms": _SHORT, "coverage": "%.3f"}
+        | {"damage": "%s"}
     )
 
 
@@ -47,11 +48,11 @@ class Table:
         own = [quoted(frame.name)] * self._named + [time] * self._timed
         um = (arrays["displacement_um"],) if "displacement_um" in arrays else ()
         numbers = np.hstack((arrays["pose"], arrays["displacement"], *um, sigma(arrays["covariance"]))).tolist()
-        last = (arrays[name].tolist() for name in ("score", "iterations", "residual_rms"))
+        last = (arrays[name].tolist() for name in ("score", "iterations", "residual_rms", "coverage"))
         damage = quoted(frame.damage or "")
         return "".join(
-            self._row % (frame.number, k, *own, *row, score, word, iterations, rms, damage)
-            for k, (row, word, score, iterations, rms) in enumerate(zip(numbers, status, *last, strict=True))
+            self._row % (frame.number, k, *own, *row, score, word, *tail, damage)
+            for k, (row, word, score, *tail) in enumerate(zip(numbers, status, *last, strict=True))
         )
 
 

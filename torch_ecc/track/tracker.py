@@ -21,8 +21,9 @@ from torch_ecc.core.pyramid import SMALLEST_COARSE, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, iterate
+from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
-from torch_ecc.track.recover import Past, Recovery, expected_score, suspect
+from torch_ecc.track.recover import Past, Recovery, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
@@ -47,7 +48,8 @@ class Tracker(nn.Module):
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
     the frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in the frame
-    it is out of view; ``search``: look for a template that is lost, or looks less like itself than usual, near where it
+    it is out of view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
+    (see core.robust); False is plain least squares; ``search``: look for a template that is lost, or looks less like itself than usual, near where it
     is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
     more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or "native", see
     settings.Settings.
@@ -89,13 +91,14 @@ class Tracker(nn.Module):
         device: torch.device | str | None = None,
         min_score: float = 0.5,
         min_visible: float = 0.25,
+        robust: bool = True,
         search: bool = True,
         backend: str = "auto",
     ) -> None:
         super().__init__()
         if prediction not in PREDICTIONS:
             raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
-        self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, backend)
+        self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, robust, backend)
         self.prediction, self.search = prediction, search
         self.criterion = make_criterion(criterion, illumination)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
@@ -252,8 +255,8 @@ class Tracker(nn.Module):
         state["tracked"].zero_()  # what comes next has made more than one step
         pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
         status, origin = (none.to(torch.int8) + int(code) for code in (Status.DAMAGED, Origin.TRACKED))
-        unknown = torch.diag_embed(torch.full_like(pose, torch.inf))
-        return Estimate(pose, pose - state["start"], none, status, none.long(), unknown, none.clone(), origin)
+        unknown, moved = torch.diag_embed(torch.full_like(pose, torch.inf)), pose - state["start"]
+        return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone())
 
     def track_sequence(self, frames: Iterable[Tensor | None], *, stop_at_damage: bool = False) -> Track:
         """Poses in every frame of a sequence: Track (F, R, ...).
@@ -292,7 +295,8 @@ class Tracker(nn.Module):
             finer = self.references[level - 1], images[level - 1]
             better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
-        return solve(self.references[0], images[0], pose, self.settings, self._buffers["start"])
+        state = self._buffers
+        return solve(self.references[0], images[0], pose, self.settings, state["start"], state["score"])
 
     def _advance(self, estimate: Estimate) -> Estimate:
         """One frame on, in which nothing is suspect: the next state, and the ``estimate``."""
