@@ -223,7 +223,7 @@ def test_micrometres_are_in_the_label(tmp_path):
         (picture,) = (frame.picture() for frame in open_frames(folder / "overlay"))
         heights.append(int((picture.amax(0)[100:235, 245:440] < 60).any(1).sum()))
     assert heights[1] > 1.3 * heights[0]
-    mark = Mark(0, torch.zeros(3), 1.0, "CONVERGED", [], [], np.array([1.25, -0.5]))
+    mark = Mark(0, np.zeros(3), np.eye(2, 3), 1.0, "CONVERGED", [], [], np.array([1.25, -0.5]))
     assert "Δx +1.250 µm   Δy -0.500 µm" in mark.text("above")
 
 

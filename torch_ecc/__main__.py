@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 
@@ -15,8 +16,11 @@ def main() -> None:
     heeded = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # as under nohup
     for number in heeded:
         signal.signal(number, lambda *_: os._exit(INTERRUPTED))
+    gc.disable()  # nothing of what is imported is garbage: to look for it takes a tenth of the time
     from torch_ecc.cli import main as command_line
 
+    gc.freeze()
+    gc.enable()
     for number in heeded:
         signal.signal(number, signal.default_int_handler)
     command_line()

@@ -37,7 +37,7 @@ def demo(out: str, frames: int) -> None:
     from torch_ecc.commands.demo import run_demo
 
     with progress_bar("demo") as advance:
-        result = run_demo(Path(out), frames, advance)
+        result = run_demo(Path(out).expanduser(), frames, advance)
     console.print(result.table())
     console.print(f"In {out}/: demo.png, and track.png, overlay.mp4, track.csv ... of each method in ecc/ and ssd/")
 
@@ -100,10 +100,10 @@ def simulate(config: str, out: str) -> None:
     """
     from torch_ecc.sim import from_config, save
 
-    simulation = from_config(read_toml(config), folder=Path(config).parent)
+    simulation = from_config(read_toml(config), folder=Path(config).expanduser().parent)
     sequence, template = simulation.sequence, simulation.template
     with progress_bar("simulate", len(sequence)) as advance:
-        save(sequence, out, metadata=simulation.metadata, progress=advance)
+        save(sequence, Path(out).expanduser(), metadata=simulation.metadata, progress=advance)
     x, y = template.center or (0.0, 0.0)
     h, w = template.size
     console.print(f"{len(sequence)} frames in {out}/. To track them:")
@@ -124,7 +124,7 @@ def reproduce(names: tuple[str, ...], quick: bool, out: str) -> None:
     try:
         for name in chosen(names):
             with progress_bar(name, unit="steps") as advance:
-                outcome = run(name, out, quick, advance)
+                outcome = run(name, Path(out).expanduser(), quick, advance)
             _say_numbers(outcome)
     except KeyboardInterrupt:
         console.print(f"Stopped from the keyboard. What was finished before is in {out}/", soft_wrap=True)
@@ -173,7 +173,7 @@ def servo(config: str, **options: Any) -> None:
     from torch_ecc.commands.servo_job import ServoJob
 
     values = read_toml(config)
-    job = ServoJob.read(values | {"align": values.get("align", {}) | given(options)}, folder=Path(config).parent)
+    job = ServoJob.read(values | {"align": values.get("align", {}) | given(options)}, folder=Path(config).expanduser().parent)
     with Console(stderr=True).status("teaching the templates") as live:
         run = run_session(job, lambda part, step: live.update(f"{part}  {step}"))
     for line in describe(job, run):

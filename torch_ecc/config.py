@@ -27,7 +27,7 @@ UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}  # pydantic's names
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """The tables of a TOML file. FileNotFoundError if it is missing, ValueError with the line if it is malformed."""
-    path = Path(path)
+    path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"config: no such file: {path}")
     try:

@@ -119,9 +119,10 @@ def track_toml(values: Mapping[str, Any], where: str = "track") -> str:
 
 def write_new(text: str, file: str) -> None:
     """Write a text into a new file, or on the screen if that is "-". ValueError if there is such a file."""
+    path = Path(file).expanduser()
     if file == "-":
         click.echo(text, nl=False)
-    elif Path(file).exists():
+    elif path.exists():
         raise ValueError(f"write-config: {file} is already there and was left as it is")
     else:
-        Path(file).write_text(text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")

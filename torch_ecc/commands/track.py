@@ -108,7 +108,8 @@ class Session:
             stopped: BaseException | None = None
             try:
                 with run:
-                    for frame in ahead(self._frames(left)):
+                    frames = self._frames(left)
+                    for frame in ahead(map(with_picture, frames) if films else frames):
                         run.step(frame)
                         progress(run.done)
             except (KeyboardInterrupt, ValueError) as error:
@@ -237,6 +238,14 @@ class _Run:
         for film in self.films:
             film.go_on(np.array(records["pose"]), status <= Status.MAX_ITERATIONS)
         self._count(status)
+
+
+def with_picture(frame: Frame) -> Frame:
+    """A frame whose picture is made already: on the thread that reads ahead."""
+    if frame.colours is None:
+        return frame
+    colours = frame.colours()
+    return dataclasses.replace(frame, colours=lambda: colours)
 
 
 def _told(error: OSError, done: int) -> OSError:

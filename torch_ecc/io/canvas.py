@@ -61,10 +61,10 @@ class Stretch(NamedTuple):
             scale = 255.0 / (self.high - self.low)
             above = np.fmax(pixels, np.asarray(self.low).astype(pixels.dtype))  # of NaN and a number the number
             pixels = cv2.convertScaleAbs(above, alpha=scale, beta=-self.low * scale)
-        planes = (
-            [pixels] * 3 if pixels.ndim == 2 else [pixels[k] for k in ((2, 1, 0) if len(pixels) == 3 else (0,) * 3)]
-        )
-        return np.asarray(cv2.merge(planes), np.uint8)
+        if pixels.ndim == 3 and len(pixels) == 3:
+            rows = np.ascontiguousarray(np.moveaxis(pixels, 0, -1))  # no copy where they were so stored
+            return np.asarray(cv2.cvtColor(rows, cv2.COLOR_RGB2BGR), np.uint8)
+        return np.asarray(cv2.cvtColor(pixels.reshape(pixels.shape[-2:]), cv2.COLOR_GRAY2BGR), np.uint8)
 
 
 class Canvas:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_ecc.core.pose import matrix
 from torch_ecc.io.canvas import WHITE, Box, Canvas, Stretch
 from torch_ecc.io.film import Film, Picture
 from torch_ecc.io.frames import Frame
@@ -33,8 +33,8 @@ class OverlayWriter:
     labels. If ``as_frames``, or if no H.264 can be written here, PNG frames come instead, in the folder overlay. Frames
     that are not 8-bit are stretched by the grey levels of the first one.
 
-    Pictures are drawn and written on a thread of their own. The result has ``.part`` in its name until the run ends, by
-    itself, by an exception or by Ctrl-C. Afterwards ``path`` is where it is, None if no frame came.
+    Pictures are encoded and written on a thread of their own. The result has ``.part`` in its name until the run ends,
+    by itself, by an exception or by Ctrl-C. Afterwards ``path`` is where it is, None if no frame came.
     """
 
     def __init__(
@@ -51,11 +51,11 @@ class OverlayWriter:
         self.path: Path | None = None
         self._status_names, self._fps = dict(status_names), fps
         self._um = None if um_matrix is None else um_matrix.detach().cpu().numpy()
-        self._outlines = [outlines(shape) for shape in shapes]
+        self._outlines = [[line.numpy() for line in outlines(shape)] for shape in shapes]
         self._trails: list[deque[NDArray[np.float64]]] = [deque(maxlen=_TRAIL_FRAMES) for _ in shapes]
         self._frames = 0
         self._shape: torch.Size | None = None
-        self._stretch: Stretch | None = None  # from here on only the other thread's
+        self._stretch: Stretch | None = None
         self._labels: Labels | None = None
         self._last: Picture | None = None
 
@@ -69,7 +69,9 @@ class OverlayWriter:
         self._shape = self._fitting(frame)
         arrays = to_arrays(record)
         marks = self._marks(arrays, words(arrays["status"], self._status_names))
-        self.film.add(partial(self._drawn, frame, marks))
+        # Drawn here: two threads that hold Python's lock most of the time hinder each other. Encoding does not hold it.
+        picture = self._drawn(frame, marks)
+        self.film.add(lambda: picture)
         self._frames += 1
 
     def go_on(self, poses: NDArray[np.float64], found: NDArray[np.bool_]) -> None:
@@ -105,17 +107,18 @@ class OverlayWriter:
         moved: Sequence[NDArray[np.float64] | None] = [None] * len(status)
         if self._um is not None:
             moved = list(arrays["displacement"][:, :2] @ self._um.T)
-        values = zip(arrays["pose"], arrays["score"], status, self._outlines, self._trails, moved, strict=True)
+        warps = matrix(torch.from_numpy(arrays["pose"]))[:, :2].numpy()
+        scores, lines = arrays["score"].tolist(), self._outlines
+        values = zip(arrays["pose"], warps, scores, status, lines, self._trails, moved, strict=True)
         marks = []
-        for number, (pose, score, word, lines, trail, um) in enumerate(values):
-            mark = Mark(number, torch.from_numpy(pose), float(score), word, lines, trail, um)
+        for number, (pose, warp, score, word, outline, trail, um) in enumerate(values):
+            mark = Mark(number, pose, warp, score, word, outline, trail, um)
             if not mark.lost:
                 trail.append(pose[:2])
-            marks.append(mark._replace(trail=list(trail)))
+            marks.append(mark)
         return marks
 
     def _drawn(self, frame: Frame, marks: list[Mark]) -> Picture:
-        """On the other thread, one frame after the other."""
         canvas = Canvas(self._picture(frame))
         clock = _clock(frame)
         w, h = canvas.measure(clock)
