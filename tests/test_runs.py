@@ -292,7 +292,10 @@ def test_a_result_is_not_overwritten(video, tmp_path):
     with pytest.raises(ValueError, match=r"holds a result already \(track.csv\): .* --force replaces it"):
         Session(job(video, tmp_path))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    assert Session(job(video, tmp_path, force=True, frames="0:9")).run().frames == 10
+    with pytest.raises(ValueError, match="holds a result already"):  # it is whole: there is nothing to resume
+        Session(job(video, tmp_path, resume=True))
+    assert Session(job(video, tmp_path, force=True, frames="0:9", overlay=False)).run().frames == 10
+    assert not (tmp_path / "overlay.mp4").exists()  # it would be of the result before
 
 
 def test_links_are_not_followed(video, tmp_path):

@@ -173,7 +173,9 @@ def servo(config: str, **options: Any) -> None:
     from torch_ecc.commands.servo_job import ServoJob
 
     values = read_toml(config)
-    job = ServoJob.read(values | {"align": values.get("align", {}) | given(options)}, folder=Path(config).expanduser().parent)
+    job = ServoJob.read(
+        values | {"align": values.get("align", {}) | given(options)}, folder=Path(config).expanduser().parent
+    )
     with Console(stderr=True).status("teaching the templates") as live:
         run = run_session(job, lambda part, step: live.update(f"{part}  {step}"))
     for line in describe(job, run):

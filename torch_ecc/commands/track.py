@@ -56,7 +56,7 @@ class Session:
 
     def __init__(self, job: TrackJob) -> None:
         self.job, self.folder = job, check_folder(job.folder(), "track")
-        if not (job.force or job.resume):
+        if not (job.force or (job.resume and Unfinished.of(self.folder))):
             refuse_overwriting(self.folder, RESULTS)
         crops = read_templates(job)
         choice = {name: getattr(job, name) for name in ("channel", "slice", "position")}
@@ -118,9 +118,15 @@ class Session:
                 raise _told(error, run.done) from error
             if run.done:
                 self._plot()
+                self._remove_old({film.film.name for film in films})
             if isinstance(stopped, ValueError):
                 raise stopped
         return Finished(run.done, run.damaged, run.lost, run.last, self.folder, stopped is not None)
+
+    def _remove_old(self, films: set[str]) -> None:
+        """What a result before had and this one does not."""
+        for name in {"overlay", "stabilised"} - films:
+            (self.folder / f"{name}.mp4").unlink(missing_ok=True)
 
     def _left(self, films: list[Pictures]) -> Unfinished | None:
         """What an unfinished run has left to go on with. ValueError if it was another one, or if nobody said so."""
@@ -269,6 +275,6 @@ def refuse_overwriting(folder: Path, names: Iterable[str]) -> None:
     there = [name for name in names if (folder / name).exists()]
     if there:
         raise ValueError(
-            f"out: {folder} holds a result already ({there[0]}): --out names another folder, --force replaces it, "
-            "--resume goes on with it if it is unfinished"
+            f"out: {folder} holds a result already ({there[0]}): --out names another folder, --force replaces it, and "
+            "--resume goes on with one that is unfinished"
         )
