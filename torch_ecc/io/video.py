@@ -58,9 +58,13 @@ def _rate(container: Any, stream: Any) -> float | None:
 
 
 def _declared(container: Any, stream: Any) -> int:
-    """How many frames the container says it holds, 0 if it does not."""
-    fps = _rate(container, stream)
-    return stream.frames or (round(container.duration / av.time_base * fps) if fps and container.duration else 0)
+    """How many frames the container says it shows, 0 if it does not."""
+    fps, seconds, frames = _rate(container, stream), (container.duration or 0) / av.time_base, int(stream.frames)
+    by_time = round(seconds * fps) if fps else 0
+    if not frames:
+        return by_time if len(container.streams) == 1 else 0  # the duration may be that of a longer sound
+    # Of MP4 and its kin a trim only hides frames, which are counted all the same.
+    return min(frames, by_time or frames) if "mp4" in container.format.name else frames
 
 
 def _read(path: Path, options: dict[str, str], numbers: range) -> Iterator[Raw]:
