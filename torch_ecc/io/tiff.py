@@ -173,7 +173,7 @@ def _one_after_the_other(tif: Any, page: Any, steps: Walk) -> _Planes:
 def _series_reader(series: Any, path: Path, samples: int) -> Callable[[int], Pixels]:
     """Reads the planes of a series by number; ``samples`` of them share a page."""
     shape = [size for letter, size in zip(series.axes, series.shape, strict=True) if letter in "YXS"]
-    depth = max(math.prod(series.shape) // math.prod(shape) // len(series), 1)
+    depth = max(math.prod(series.shape) // max(math.prod(shape), 1) // len(series), 1)
 
     def read(plane: int) -> Pixels:
         page = series[plane // samples // depth]
