@@ -229,7 +229,7 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt):
         Console(stderr=True).print("torch-ecc: stopped from the keyboard", style="red")
         sys.exit(INTERRUPTED)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MemoryError) as error:
         Console(stderr=True, highlight=False, soft_wrap=True).print(
             f"torch-ecc: {one_line(error)}", style="red", markup=False
         )
