@@ -16,13 +16,13 @@ import torch
 from results import save
 from rich.console import Console
 from rich.table import Table
+from scatter import Draws, Scatter, by_sampler, least, scatter
+from sequences import Run, track_path, under_light
 from torch import Tensor
 
 from torch_ecc.paper.errors import by_unit, in_degrees, largest, rms
 from torch_ecc.paper.result import Number, cells
-from torch_ecc.paper.scatter import Draws, Scatter, by_sampler, least, scatter
 from torch_ecc.paper.scheme import Harmonic
-from torch_ecc.paper.sequences import Run, track_path, under_light
 from torch_ecc.sim.camera.camera import Camera
 from torch_ecc.sim.camera.light import GradientLight, SpotLight
 from torch_ecc.sim.camera.sequence import Sequence

@@ -6,16 +6,16 @@ import math
 
 import pytest
 import torch
+from scatter import Draws, least, oracle, scatter
+from sequences import track_path, under_light
 
 from torch_ecc import Status, align
 from torch_ecc.core.pose import inverse, transform, turn
 from torch_ecc.core.sampling import SAMPLERS
 from torch_ecc.core.verdict import interpolation_error
-from torch_ecc.paper.bound import cramer_rao, oracle, rounding
+from torch_ecc.paper.bound import cramer_rao, rounding
 from torch_ecc.paper.methods import prepared
-from torch_ecc.paper.scatter import Draws, least, scatter
 from torch_ecc.paper.scheme import Harmonic
-from torch_ecc.paper.sequences import track_path, under_light
 from torch_ecc.sim import Sequence
 from torch_ecc.sim.camera.camera import Camera
 from torch_ecc.sim.camera.light import GradientLight, SpotLight

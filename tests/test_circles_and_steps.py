@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_ecc.paper import circles, fig6, fig7, fig8, fig9, fig10, fig11, parasitic, steps
-from torch_ecc.paper.acquisition import Bench, acquire, ease, zeroed
+from torch_ecc.paper.acquisition import Bench, ease, zeroed
 from torch_ecc.records.motion import Motion
 from torch_ecc.sim.scene.micrograph import micrograph
 from torch_ecc.sim.scene.window import Window
@@ -146,7 +146,7 @@ def test_a_window_shows_the_same_scene():
 def test_an_acquisition_says_what_is_lost_and_where_zero_is():
     path = torch.zeros(700, 3, dtype=torch.float64)
     path[:, 0] = 2 * ease(torch.linspace(-1, 1.5, 700))
-    got = acquire(path, Bench(microscope=Microscope(region_px=(200, 220), exposure_s=0.0)), lambda: None)
+    got = Bench(Microscope(region_px=(200, 220), exposure_s=0.0)).acquire(path, lambda: None)
     frames = len(got.truth.time_s)
     assert frames == got.tracks["ECC"].pose.shape[0]
     error = (got.tracks["ECC"].pose - got.truth.pose)[:, :2].abs()

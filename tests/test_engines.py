@@ -11,10 +11,9 @@ from torch import Tensor
 
 from torch_ecc import Estimate, Status, align, prepare
 from torch_ecc.core import solver
-from torch_ecc.core.normal import Normal
-from torch_ecc.core.reference import Reference
+from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solution import Solution
+from torch_ecc.core.solution import Solution, Trust
 from torch_ecc.core.verdict import judge
 
 NUDGE = torch.tensor([1e-4, -7e-5, 2e-6], dtype=torch.float64)  # px, px, rad
@@ -24,15 +23,17 @@ engines = pytest.mark.parametrize(
 )
 
 
-def page(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
+def page(
+    reference: Reference, image: Tensor, start: Tensor, settings: Settings, blocks: Tensor | None = None
+) -> Solution:
     """The page's answer for each template by itself."""
     views = [image if len(image) == 1 else image[k : k + 1] for k in range(len(start))]
+    trust = [None if blocks is None else Trust(torch.tensor([0]), blocks[k : k + 1]) for k in range(len(start))]
     parts = [
-        solver.solve(reference.select(torch.tensor([k])), view, start[k : k + 1], settings)
+        solver.solve(reference.select(torch.tensor([k])), view, start[k : k + 1], settings, trust[k])
         for k, view in enumerate(views)
     ]
-    *values, normals = zip(*parts, strict=True)
-    return Solution(*map(torch.cat, values), Normal(*map(torch.cat, zip(*normals, strict=True))))
+    return each(lambda *values: torch.cat(values), *parts)
 
 
 def differs(a: Estimate, b: Estimate) -> Tensor:
@@ -41,16 +42,22 @@ def differs(a: Estimate, b: Estimate) -> Tensor:
     return apart | ((a.residual_rms - b.residual_rms).abs() > 1e-3 * b.residual_rms + 1e-5)
 
 
-def ill_posed(reference: Reference, image: Tensor, start: Tensor, settings: Settings, answer: Estimate) -> Tensor:
+def ill_posed(
+    reference: Reference,
+    image: Tensor,
+    start: Tensor,
+    settings: Settings,
+    answer: Estimate,
+    blocks: Tensor | None = None,
+) -> Tensor:
     """Templates (B,) whose ``answer`` by the page is another one when image and start move by next to nothing: along an
     edge, or in another scene, rounding grows from step to step, and a pixel may be on either side of the border."""
     draw = torch.Generator().manual_seed(0)
     changed = torch.zeros(len(start), dtype=torch.bool)
     for size in (-1.0, 1.0, -3.0, 3.0):
         noise = 3e-4 * size * image.float().std() * torch.randn(image.shape, generator=draw)
-        nudged = judge(
-            reference, page(reference, image.float() + noise, start + size * NUDGE, settings), start, settings
-        )
+        there = page(reference, image.float() + noise, start + size * NUDGE, settings, blocks)
+        nudged = judge(reference, there, start, settings)
         changed |= differs(nudged, answer)
     return changed
 
@@ -61,17 +68,28 @@ def drawn(seed: int) -> tuple[Problem, Settings]:
     return Problem.drawn(draw), Settings(draw.choice(SAMPLERS), draw.randint(1, 15))
 
 
+def trusted(reference: Reference, seed: int) -> Tensor:
+    """Trust (B, blocks) in each block of templates: whole, none, or anything between."""
+    draw = torch.Generator().manual_seed(seed)
+    value = torch.rand(reference.blocks.weight.shape, generator=draw)
+    return (3 * value - 0.5).clamp(0, 1)
+
+
 @engines
 @pytest.mark.parametrize("criterion", CRITERIA, ids=str)
 def test_an_engine_gives_what_the_page_gives(engine, criterion):
-    """Status and pose without exception; of what is found all else; of what is not, too, unless it is ill-posed."""
+    """Status and pose without exception; of what is found all else; of what is not, too, unless it is ill-posed. In
+    every other problem some blocks are trusted in part or not at all."""
     found = 0
     for seed in range(40):
         problem, settings = drawn(seed + 1000 * CRITERIA.index(criterion))
         reference, image, start = problem.made(criterion)
         assert engine.takes(reference, image, settings), problem
-        exact = page(reference, image, start, settings)
-        a, b = (judge(reference, s, start, settings) for s in (engine.solve(reference, image, start, settings), exact))
+        blocks = trusted(reference, seed) if seed % 2 else None
+        exact = page(reference, image, start, settings, blocks)
+        trust = None if blocks is None else Trust(torch.arange(len(start)), blocks)
+        other = engine.solve(reference, image, start, settings, trust)
+        a, b = (judge(reference, s._replace(trust=blocks), start, settings) for s in (other, exact))
         good = Status.good(b.status)
         assert torch.equal(a.status, b.status), problem
         near = (1e-3 * b.sigma.where(good[:, None], 0.0)).clamp(min=1e-4)  # an edge fixes the place along it to 0.2 px
@@ -81,10 +99,23 @@ def test_an_engine_gives_what_the_page_gives(engine, criterion):
         torch.testing.assert_close(a.sigma[good], b.sigma[good], rtol=1e-3, atol=0, msg=str(problem))
         apart = differs(a, b) & (good | exact.normal.inverse.any(-1).any(-1))  # where nothing is fitted steps are 0 / 0
         if apart.any():
-            apart &= good | ~ill_posed(reference, image, start, settings, b)
+            apart &= good | ~ill_posed(reference, image, start, settings, b, blocks)
         assert not apart.any(), problem
         found += int(good.sum())
     assert found > 10
+
+
+@engines
+def test_some_of_many_are_solved_as_they_are_alone(engine):
+    """Those that trust is about, in its order."""
+    reference, image, start = Problem((31, 40), 5, seed=4).made(CRITERIA[1])
+    index = torch.tensor([3, 0, 3])
+    blocks = trusted(reference, 1)[index]
+    found = engine.solve(reference, image, start, Settings(), Trust(index, blocks))
+    exact = page(reference.select(index), image[index], start[index], Settings(), blocks)
+    torch.testing.assert_close(found.pose, exact.pose, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.sums[:, 0], exact.sums[:, 0])
+    torch.testing.assert_close(found.normal.bread, exact.normal.bread, rtol=1e-4, atol=1e-2)
 
 
 @engines

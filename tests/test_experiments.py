@@ -75,7 +75,7 @@ def test_the_bound_of_a_template_that_lies_turned_is_along_its_own_axes():
 
 def test_a_scene_kept_is_the_scene_rendered():
     scene, poses = PlaneWaves.random(seed=3), torch.tensor([[30.0, 20.0, 0.2]]).double()
-    wide = scheme.Kept(scene, scene.render(poses + torch.tensor((4.0, 4.0, 0.0)), (48, 68)))
+    wide = scheme.Kept(scene.render(poses + torch.tensor((4.0, 4.0, 0.0)), (48, 68)))
     for camera in (Camera(size=(40, 60)), Camera(size=(40, 60), blur_sigma=1.0)):
         assert torch.equal(camera.capture(wide, poses), camera.capture(scene, poses))
     draws = Camera(size=(40, 60), noise_sigma=5.0).capture(wide, poses.expand(2, 3))
@@ -103,7 +103,7 @@ def test_uneven_light_short(spread):
             worst = kind[0, names.index(name)]
             assert worst[0] < px, name
             assert worst[1] < deg, name
-    theta = spread.first[0, :, 1]
+    theta = spread[0, 0, :, 1]
     assert theta[names.index("ref34")] > 2 * theta[names.index("gain")]
     assert theta[names.index("ssd")] == pytest.approx(float(theta[names.index("ref34")]), abs=2e-3)
 
@@ -202,7 +202,7 @@ def test_contrast_goes_about_the_mean():
 
 
 def test_limits_are_the_last_level_before_the_first_failure():
-    swept = robustness.Sweep("blur", "blur", (0, 1, 2, 3), lambda v: trials.Change())
+    swept = robustness.Sweep("blur", (0, 1, 2, 3), lambda v: trials.Change())
     rates = {"linear": [1, 0.9, 0.5, 1], "ssd": [0.5, 1, 1, 1], "gain": [1, 1, 1, 1], trials.UNNOTICED: [0] * 4}
     found = robustness.limits(swept, trials.Found(rates, {}))
     assert found.keys() == {"linear", "ssd", "gain"}

@@ -30,7 +30,7 @@ def test_both_correlations_are_what_they_say(criterion, seed):
     part = reweigh(reference, u < 0.4)
     t, w = part.signal[0, 3], part.weight[0].double()
     g = t + 30 * torch.randn(t.shape, generator=draw) + 80 * reference.uv[0, 0] - 50 * reference.uv[0, 1]
-    _, sums, total = summed(part, g[None])
+    _, sums, total = summed(part, g[None], part.weight)
     torch.testing.assert_close(total[:, :10], sums.double().sum(-1), rtol=1e-5, atol=1e-3)
     torch.testing.assert_close(total[:, 10:], sums[:, 7:].double().square().sum(-1), rtol=1e-5, atol=0)
     one = torch.ones_like(u)
@@ -72,5 +72,5 @@ def test_what_the_columns_fit_of_the_noise_is_made_up_for(criterion):
     reference, _, _ = Problem((11, 11), texture="rich", dtype=torch.float32).made(criterion)
     noise = 2 * torch.randn(2000, 121, generator=torch.Generator().manual_seed(0))
     many = reference.select(torch.zeros(2000, dtype=torch.long))
-    _, _, total = summed(many, reference.signal[:, 3] + noise)
+    _, _, total = summed(many, reference.signal[:, 3] + noise, many.weight)
     assert float((total[:, 6] / many.normal.freedom).mean()) == pytest.approx(4, rel=0.04)

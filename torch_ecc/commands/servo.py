@@ -21,7 +21,7 @@ from torch_ecc.core.pose import transform
 from torch_ecc.io import OverlayWriter
 from torch_ecc.io.output import check_folder, part, publish
 from torch_ecc.io.summary import write_json
-from torch_ecc.servo.record import Step
+from torch_ecc.servo.record import Log, Step
 
 HEADER = (
     "part,time_s,x_px,y_px,theta_rad,error_x_px,error_y_px,error_theta_rad,vx_um_per_s,vy_um_per_s,omega_rad_per_s,"
@@ -92,7 +92,7 @@ class LogWriter:
 
 def pictures(job: ServoJob, alignee: Alignee, run: Run) -> dict[str, Figure]:
     """Velocities (Fig. 13), errors and the three steps (Fig. 12) of a run, as far as it went."""
-    logs = [step.log for step in run.alignment[1:3] if step is not None and len(step.log.time)]
+    logs = _logs(run)
     if not logs:
         return {}
     titles = ["Step 2: the substrate", "Step 3: the probe"][: len(logs)]
@@ -103,10 +103,13 @@ def pictures(job: ServoJob, alignee: Alignee, run: Run) -> dict[str, Figure]:
     }
 
 
+def _logs(run: Run) -> list[Log]:
+    return [result.log for result in run.alignment.results if len(result.log.time)]
+
+
 def draw_three_steps(job: ServoJob, alignee: Alignee, run: Run) -> Figure:
     """Where both parts were found at first, and where they were after each step."""
-    logs = [step.log for step in run.alignment[1:3] if step is not None and len(step.log.time)]
-    poses = [run.alignment.detected, *([log.pose[-1] for log in logs])]
+    poses = [run.alignment.detected, *(log.pose[-1] for log in _logs(run))]
     box, landing = square(job.align.size), torch.tensor([alignee.substrate.point], dtype=torch.float64)
     substrate = [poses[0][0]] + [poses[1]] * (len(run.frames) - 1)
     probe = [poses[0][1]] * 2 + [poses[-1]]
@@ -123,7 +126,7 @@ def summary(job: ServoJob, run: Run) -> dict[str, Any]:
     """What became of a run, for scripts."""
     um = job.cell.mounts["substrate"].um_per_px
     x, y, theta = run.error.tolist()
-    steps = {name: step for name, step in zip(PARTS, run.alignment[1:3], strict=True) if step is not None}
+    steps = dict(zip(PARTS, run.alignment.results, strict=False))
     return {
         "aligned": run.alignment.aligned,
         "ending": run.alignment.ending.name,
@@ -142,7 +145,7 @@ def summary(job: ServoJob, run: Run) -> dict[str, Any]:
 def describe(job: ServoJob, run: Run) -> list[str]:
     """The same in words."""
     found, out = summary(job, run), Path(job.align.out)
-    lines = [f"{name}: {step}" for name, step in zip(PARTS, run.alignment[1:3], strict=True) if step is not None]
+    lines = [f"{name}: {step}" for name, step in zip(PARTS, run.alignment.results, strict=False)]
     error, miss = found["substrate_error"], found["tip_miss"]
     lines.append(f"Truly, the substrate is off by {error['nm']:.1f} nm and {abs(error['theta_deg']):.4f} deg.")
     if run.alignment.aligned:

@@ -99,6 +99,11 @@ class Run(NamedTuple):
     miss: Tensor
     frames: list[Tensor]
 
+    @property
+    def off(self) -> tuple[float, float, float]:
+        """By how much: the substrate in px and in deg, the tip in px."""
+        return float(self.error[:2].norm()), math.degrees(abs(float(self.error[2]))), float(self.miss.norm())
+
 
 class Alignee(NamedTuple):
     """The workstation of a job with both parts ready to be aligned."""

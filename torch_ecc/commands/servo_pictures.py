@@ -21,7 +21,9 @@ LEAST = 1e-3  # px and deg: where the logarithmic axes of errors end
 def draw_velocities(logs: Sequence[Log], titles: Sequence[str]) -> Figure:
     """Commanded velocities over time: a panel for x and y of each log, and one for theta if there is such an axis."""
     panels = [
-        (log, title, k) for log, title in zip(logs, titles, strict=True) for k in (0, 2)[: log.velocity.shape[1] - 1]
+        (log, f"{title}, {'theta' if k else 'x and y'}", k)
+        for log, title in zip(logs, titles, strict=True)
+        for k in (0, 2)[: log.velocity.shape[1] - 1]
     ]
     figure = new_figure(3.9 * len(panels), 3.0)
     for axes, (log, title, k) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
@@ -29,8 +31,7 @@ def draw_velocities(logs: Sequence[Log], titles: Sequence[str]) -> Figure:
         for column, values_of in enumerate(values.unbind(1), k):
             axes.step(log.time, values_of, where="post", color=COLOURS[column], label=VELOCITIES[column])
         axes.axhline(0, color="0.4", lw=0.7)
-        axes.set(xlabel="time (s)", ylabel="velocity (deg/s)" if k else "velocity (µm/s)")
-        axes.set_title(f"{title}, {'theta' if k else 'x and y'}", loc="left")
+        axes.set(title=title, xlabel="time (s)", ylabel="velocity (deg/s)" if k else "velocity (µm/s)")
         axes.legend(loc="best")
     return figure
 
@@ -47,8 +48,7 @@ def draw_errors(logs: Sequence[Log], titles: Sequence[str], gain: float) -> Figu
             law = values[0] * (-gain * log.time).exp()
             axes.semilogy(log.time, law.clamp(min=LEAST), color="0.55", lw=0.8, ls="--", zorder=1)
         axes.plot([], [], color="0.55", lw=0.8, ls="--", label=rf"$e_0\,e^{{-\lambda t}}$, $\lambda$ = {gain:g}/s")
-        axes.set(xlabel="time (s)", ylabel="|error|", ylim=(LEAST, None))
-        axes.set_title(title, loc="left")
+        axes.set(title=title, xlabel="time (s)", ylabel="|error|", ylim=(LEAST, None))
         axes.legend(loc="upper right")
     return figure
 
@@ -68,9 +68,7 @@ def draw_steps(frames: Sequence[Tensor], outlines: Sequence[Sequence[Tensor]], t
         axes.plot(*tip.T, color="#ffb000", marker="o", mfc="none", ms=13, mew=1.8)
         axes.plot(*landing.T, color="#ff4d4d", marker="+", ms=13, mew=1.8)
         axes.set_axis_off()
-        axes.set_xlim(-0.5, w - 0.5)
-        axes.set_ylim(h - 0.5, -0.5)
-        letter(axes, title)
+        axes.set(title=letter(title), xlim=(-0.5, w - 0.5), ylim=(h - 0.5, -0.5))
     return figure
 
 

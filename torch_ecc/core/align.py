@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_ecc.core import native, solver
+from torch_ecc.core import native, robust, solver
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
@@ -20,7 +20,7 @@ def align(
     reference: Reference,
     image: Tensor,
     pose: Tensor,
-    **options: str | float,
+    **options: str | float | bool,
 ) -> Estimate:
     """Poses of B prepared templates in their images: (B or 1, 1, H, W), start (B, 3) px, px, rad -> Estimate.
 
@@ -47,9 +47,14 @@ def align(
 
 
 def solve(
-    reference: Reference, image: Tensor, pose: Tensor, settings: Settings, origin: Tensor | None = None
+    reference: Reference,
+    image: Tensor,
+    pose: Tensor,
+    settings: Settings,
+    origin: Tensor | None = None,
+    usual: Tensor | None = None,
 ) -> Estimate:
     """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype; ``origin``:
-    what displacements count from, by default the ``pose``."""
+    what displacements count from, by default the ``pose``; ``usual`` (B,): the templates' scores so far."""
     engine = native if native.takes(reference, image, settings) else solver
-    return judge(reference, engine.solve(reference, image, pose, settings), pose, settings, origin)
+    return judge(reference, robust.solve(engine.solve, reference, image, pose, settings, usual), pose, settings, origin)

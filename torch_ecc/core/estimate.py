@@ -55,7 +55,8 @@ class Estimate(NamedTuple):
     ``pose`` (R, 3) px, px, rad; ``displacement`` (R, 3) pose minus the pose at start, theta unwrapped; ``score`` (R,)
     zero-mean normalised correlation in [-1, 1]; ``status`` (R,) int8, see Status; ``iterations`` (R,);
     ``covariance`` (R, 3, 3) of the pose, infinite on the diagonal where the status is a failure; ``residual_rms``
-    (R,) in grey levels of the frame; ``origin`` (R,) int8, see Origin: a search's only where it gave the pose.
+    (R,) in grey levels of the frame; ``origin`` (R,) int8, see Origin: a search's only where it gave the pose;
+    ``coverage`` (R,) share of the template's weight in sight that the solve believed, in [0, 1].
     """
 
     pose: Tensor
@@ -66,6 +67,7 @@ class Estimate(NamedTuple):
     covariance: Tensor
     residual_rms: Tensor
     origin: Tensor
+    coverage: Tensor
 
     @property
     def sigma(self) -> Tensor:

@@ -26,7 +26,7 @@ from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solution import Solution
+from torch_ecc.core.solution import Solution, Trust
 
 SOURCES = Path(__file__).parent / "csrc"
 DEGREE = {"bilinear": 1, "bspline3": 3, "bspline5": 5}
@@ -70,24 +70,29 @@ def _code(criterion: Criterion) -> int | None:
     return LIGHT.get(criterion.illumination) if type(criterion) is ECC else CODE.get(type(criterion))
 
 
-def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
-    """Poses of B templates in (B or 1, 1, H, W) of one of ``DTYPES`` from ``start`` (B, 3) on: ``solver.solve``."""
+def solve(
+    reference: Reference, image: Tensor, start: Tensor, settings: Settings, trust: Trust | None = None
+) -> Solution:
+    """``solver.solve``: poses of B templates in (B or 1, 1, H, W) of one of ``DTYPES`` from ``start`` (B, 3) on, or of
+    those that a ``trust`` is about."""
     code, degree = _code(reference.criterion), DEGREE[settings.interpolation]
+    rest = (None, None) if trust is None else (trust.blocks, trust.which)
     *values, partial, moments = operator()(
-        image, start, *reference.packed, code, degree, settings.max_iterations, settings.tolerance
+        image, start, *reference.packed, code, degree, settings.max_iterations, settings.tolerance, *rest
     )
     pose, error, iterations, gain, sums, total = values
-    normal = _visible(reference, partial, moments) if len(partial) else reference.normal
+    normal = _counted(reference, partial, moments, trust) if len(partial) else reference.normal
     return Solution(pose, error, iterations, gain, sums, total, normal)
 
 
-def _visible(reference: Reference, index: Tensor, moments: Tensor) -> Normal:
-    """The normal equations with those of the templates at ``index`` (n,) made anew from ``moments`` (n, ...)."""
+def _counted(reference: Reference, index: Tensor, moments: Tensor, trust: Trust | None) -> Normal:
+    """The normal equations with those of the templates at ``index`` (n,) made anew from ``moments`` (n, ...); with
+    ``trust`` of those that it is about."""
     most, columns = packed.MOST, reference.K.shape[1]
     number, *matrices, gram, noise = moments.split((1, most**2, most**2, 16, 8), 1)
     normal, power = (matrix.view(-1, most, most)[:, :columns, :columns] for matrix in matrices)
     anew = normal_equations(Moments(number[:, 0], normal, power, gram.view(-1, 4, 4), noise.view(-1, 2, 4)))
-    if len(index) == len(reference.K):
+    if trust is not None or len(index) == len(reference.K):  # with trust all of them are
         return anew
     return each(lambda old, new: old.index_copy(0, index, new), reference.normal, anew)
 

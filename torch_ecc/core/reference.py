@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import lasting
-from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
+from torch_ecc.core.criteria import Criterion, centred, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.noise import INSTRUMENT_BLUR, template_noise, wiener_weight
 from torch_ecc.core.normal import Moments, Normal, normal_equations
@@ -40,6 +40,7 @@ ENOUGH = 1500  # pixels of a template tell well where to go; the first iteration
 SPARSEST = 4  # px between those that are kept
 BLOCK = 6  # px: side of the blocks over which the last look at a patch is summed
 PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which takes some 600 bytes on the way
+HALF_FULL = 0.5  # of the fullest block's weight: a block with less of it tells too little
 SMALLEST = 5  # px: side of the smallest template
 LEVELS = 2**15 - 1  # a template is rounded to so many steps on either side: an engine may hold it in 16 bits
 
@@ -95,6 +96,20 @@ class Noise(NamedTuple):
     alias: dict[str, Tensor]
 
 
+class Blocks(NamedTuple):
+    """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean
+    and of its ``square``, the mean square of their slopes' texture, ``slope``; and which of those that hold pixels
+    enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``: either."""
+
+    weight: Tensor
+    t: Tensor
+    square: Tensor
+    slope: Tensor
+    flat: Tensor
+    steep: Tensor
+    enough: Tensor
+
+
 class _Groups(NamedTuple):
     criterion: Criterion
     grid: Grid
@@ -127,6 +142,12 @@ class Reference(_Groups):
     def uv(self) -> Tensor:
         """The light columns' coordinates: pixel positions in ``Place.unit``, (B, 2, N)."""
         return self.place.unit @ self.grid.pixels
+
+    @cached_property
+    @lasting
+    def blocks(self) -> Blocks:
+        """What the template has in each block, made once for as long as the reference lives."""
+        return _blocks(self)
 
     @cached_property
     @lasting
@@ -270,6 +291,19 @@ def _place(grid: Grid, centre: Tensor, weight: Tensor) -> Place:
     return Place(centre, radius, lever, lever.square(), torch.cat((one, -centre[:, :, None]), -1) / half)
 
 
+def _blocks(reference: Reference) -> Blocks:
+    grid, weight = reference.grid, reference.weight
+    t, _ = centred(reference.signal[:, 3], weight)
+    slopes = reference.columns.wiener * reference.signal[:, :2].square().sum(1)
+    rows = torch.stack((weight, weight * t, weight * t * t, weight * slopes), 1)
+    sums = rows.new_zeros(len(t), 4, grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
+    count, of_t, square, slope = sums.unbind(1)
+    slope = slope / count.clamp(min=1e-30)
+    enough = count > HALF_FULL * count.amax(1, keepdim=True)
+    middle = torch.where(enough, slope, torch.nan).nanmedian(1, keepdim=True).values
+    return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle), enough)
+
+
 def _columns(local: Tensor, images: tuple[Tensor, Tensor], wiener: Tensor, weight: Tensor) -> Columns:
     """Rounded columns from ``images`` [d/dx, d/dy, t] (B, 3, N), blurred and raw, at ``local`` (B, 2, N) about the
     centre."""
@@ -312,19 +346,19 @@ def _solved(criterion: Criterion, grid: Grid, place: Place, columns: Columns, no
     return Reference(criterion, grid, place, columns, K, normal, noise, None)
 
 
-def reweigh(reference: Reference, visible: Tensor) -> Reference:
-    """The reference of which only the pixels ``visible`` (B, N), bool, count: new weight, K and normal equations."""
-    columns = reference.columns._replace(weight=reference.columns.weight * visible)
+def reweigh(reference: Reference, counted: Tensor) -> Reference:
+    """The reference whose pixels count as ``counted`` (B, N), 0 to 1 or bool: new weight, K and normal equations."""
+    columns = reference.columns._replace(weight=reference.columns.weight * counted)
     K, normal = _normal_equations(reference.criterion, reference.grid, reference.place, columns)
     return reference._replace(columns=columns, K=K, normal=normal)
 
 
-def restrict(reference: Reference, visible: Tensor) -> Reference:
+def restrict(reference: Reference, counted: Tensor) -> Reference:
     """``reweigh`` for the loop alone, which needs no more than K and the weights (``normal`` stays that of all pixels:
-    nothing to judge by): with V the pixels ``visible`` (B, N)
-    and N = Z W R^T of all, Z W V = N (K V), so that K' = (N (K V) R^T)^-1 N (K V).
+    nothing to judge by): with V by how much pixels are ``counted`` (B, N) and N = Z W R^T of all, Z W V = N (K V), so
+    that K' = (N (K V) R^T)^-1 N (K V).
     """
-    columns, KV = reference.columns._replace(weight=reference.weight * visible), reference.K * visible[:, None]
+    columns, KV = reference.columns._replace(weight=reference.weight * counted), reference.K * counted[:, None]
     R = reference.criterion.columns(reference.signal, reference.uv)
     inverse, _ = safe_inverse(reference.normal.matrix @ (KV @ R.mT).to(reference.place.radius.dtype))
     return reference._replace(columns=columns, K=(inverse @ reference.normal.matrix).to(KV.dtype) @ KV)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
+from functools import cached_property
 from math import inf
 from typing import Self, TypeVar
 
@@ -32,6 +33,7 @@ class Settings:
     tolerance: float = described(1e-3, "remaining error at the template's farthest pixel, px")
     min_score: float = described(0.5, "below this correlation a template is lost")
     min_visible: float = described(0.25, "with less of its weight in the frame a template is out of view")
+    robust: bool = described(True, "blocks that do not fit, as of what covers a part of the template, count less")
     backend: str = described(
         "auto", "on a CPU; auto is native where that is compiled or can be", ("auto", "torch", "native")
     )
@@ -46,6 +48,11 @@ class Settings:
                 hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
                 raise ValueError(f"{where}: unknown option {name!r} ({hint})")
         return cls(**options)  # type: ignore[arg-type]
+
+    @cached_property
+    def once(self) -> Self:
+        """The same for a single iteration."""
+        return replace(self, max_iterations=1)
 
     def __post_init__(self) -> None:
         for each in fields(self):

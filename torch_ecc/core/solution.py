@@ -14,11 +14,19 @@ from torch_ecc.core.reference import Reference
 FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 
 
+class Trust(NamedTuple):
+    """Of the templates at ``which`` (n,): by how much the pixels of their ``blocks`` (n, blocks) count, 0 to 1."""
+
+    which: Tensor
+    blocks: Tensor
+
+
 class Solution(NamedTuple):
     """What an engine answers with, of B templates: ``pose`` (B, 3); ``error`` (B,), the predicted remaining error in px
     at the farthest pixel; ``iterations`` (B,); of the last look the patch's ``gain`` (B,), ``sums`` (B, 10, blocks), in
-    every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 3) over the blocks with that of the squares
-    of the last three, and the ``normal`` equations of the pixels in sight. A gain or total not finite is 0."""
+    every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 3) over the blocks, as they are trusted, with
+    that of the squares of the last three, and the ``normal`` equations of the pixels that count: in sight, and as their
+    blocks are trusted. A gain or total not finite is 0. ``trust`` (B, blocks) in these, None if it is whole."""
 
     pose: Tensor
     error: Tensor
@@ -27,25 +35,32 @@ class Solution(NamedTuple):
     sums: Tensor
     total: Tensor
     normal: Normal
+    trust: Tensor | None = None
 
 
-def summed(reference: Reference, g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def summed(
+    reference: Reference, g: Tensor, seen: Tensor, trusted: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Gain, sums and total of patches g (B, N), see ``Solution``: over the pixels of each block, of the weights w times
 
         1, g0, g0^2, t0 g0, u g0, v g0, e^2, and of the first three rows of K times e,
 
     with g0 and t0 the patch and the template less their weighted means, (u, v) the pixel's place in ``Place.unit``, and
-    e what the criterion's model leaves of g. Of a patch that is flat but for rounding g0 is 0.
+    e what the criterion's model leaves of g. Of a patch that is flat but for rounding g0 is 0. The ``reference`` weighs
+    pixels by their blocks' trust; w is what is ``seen`` (B, N) without it, so that blocks that are not ``trusted`` have
+    sums too. K is zero there.
     """
     w, (residual, gain) = reference.weight, reference.criterion.fit(reference, g)
     (g0, norm), (t0, _) = centred(g, w), centred(reference.signal[:, 3], w)
-    power, mean = norm.square(), g[:, 0] - g0[:, 0]
+    power, mean, level = norm.square(), g[:, 0] - g0[:, 0], w.sum(-1)
+    w = seen
     wg, (u, v) = w * g0, reference.uv.unbind(1)
     influence = (reference.K[:, :3] * residual[:, None]).unbind(1)
     rows = torch.stack((w, wg, wg * g0, wg * t0, wg * u, wg * v, w * residual * residual, *influence), 1)
     grid, dtype = reference.grid, reference.place.radius.dtype
     sums = rows.new_zeros(len(g), rows.shape[1], grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
-    rough = power > FLAT * (power + mean.square() * w.sum(-1))
+    rough = power > FLAT * (power + mean.square() * level)
     sums[:, 1:6] *= rough[:, None, None]
-    total = torch.cat((sums.sum(-1, dtype=dtype), sums[:, 7:].to(dtype).square().sum(-1)), 1)
+    counted = sums if trusted is None else torch.cat((sums[:, :7] * trusted[:, None], sums[:, 7:]), 1)
+    total = torch.cat((counted.sum(-1, dtype=dtype), sums[:, 7:].to(dtype).square().sum(-1)), 1)
     return gain.to(dtype).nan_to_num_(0.0, 0.0, 0.0), sums, total.nan_to_num_(0.0, 0.0, 0.0)

@@ -17,7 +17,7 @@ from torch_ecc.core.pose import retract
 from torch_ecc.core.reference import Reference, each, restrict, reweigh
 from torch_ecc.core.sampling import Sampler, inside, is_cpu, make_sampler
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solution import Solution, summed
+from torch_ecc.core.solution import Solution, Trust, summed
 
 COARSE_TOLERANCE = 0.02  # px; the bilinear iterations only have to come near: their own bias is some 0.005 px
 SECANT_RANGE = 1.0  # px; steps beyond it are not accelerated
@@ -44,32 +44,59 @@ class State(NamedTuple):
         return State(pose, torch.zeros_like(pose), none, none + 1, none + inf, none.long())
 
 
-def solve(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
-    """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on; on a CPU in chunks that fit its cache."""
-    image, many = image.float(), len(start)
+def solve(
+    reference: Reference, image: Tensor, start: Tensor, settings: Settings, trust: Trust | None = None
+) -> Solution:
+    """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on, or of those that a ``trust`` is about; on a
+    CPU in chunks that fit its cache."""
+    image, blocks = image.float(), None
+    if trust is not None:
+        blocks, reference, start = trust.blocks, reference.select(trust.which), start[trust.which]
+        image = image if len(image) == 1 else image[trust.which]
+    many = len(start)
     some = max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1) if is_cpu(start.device) else many
     if many <= some:
-        return solve_at_once(reference, image, start, settings)
-    parts = [slice(k, k + some) for k in range(0, many, some)]
-    views = [image if len(image) == 1 else image[part] for part in parts]
-    found = [solve_at_once(reference.select(p), v, start[p], settings) for p, v in zip(parts, views, strict=True)]
+        return solve_at_once(reference, image, start, settings, blocks)
+    found = []
+    for part in (slice(k, k + some) for k in range(0, many, some)):
+        view, trusted = image if len(image) == 1 else image[part], None if blocks is None else blocks[part]
+        found.append(solve_at_once(reference.select(part), view, start[part], settings, trusted))
     return each(lambda *values: torch.cat(values), *found)
 
 
-def solve_at_once(reference: Reference, image: Tensor, start: Tensor, settings: Settings) -> Solution:
+def solve_at_once(
+    reference: Reference, image: Tensor, start: Tensor, settings: Settings, trusted: Tensor | None = None
+) -> Solution:
     """First bilinear on the coarser grid, to come near; then with the chosen sampler on all pixels, with the iterations
-    that are left."""
+    that are left. ``trusted``: ``Trust.blocks``."""
     most, coarse, state = settings.max_iterations, reference.coarse or reference, State.start(start)
     if most > 1 and not (settings.interpolation == "bilinear" and coarse is reference):
         near = max(settings.tolerance, COARSE_TOLERANCE)
-        state, _, _ = iterate(coarse, image, "bilinear", state, near, max(most * 2 // 3, 1))
-    state, g, visible = iterate(reference, image, settings.interpolation, state, settings.tolerance, most)
-    reference = reference if visible is None else reweigh(reference, visible)
-    return Solution(state.pose, state.error, state.iterations, *summed(reference, g), reference.normal)
+        state, _, _ = iterate(coarse, image, "bilinear", state, near, max(most * 2 // 3, 1), trusted)
+    state, g, visible = iterate(reference, image, settings.interpolation, state, settings.tolerance, most, trusted)
+    counted = counting(reference, visible, trusted)
+    fitted = reference if counted is None else reweigh(reference, counted)
+    seen = reference.weight if visible is None else reference.weight * visible
+    return Solution(state.pose, state.error, state.iterations, *summed(fitted, g, seen, trusted), fitted.normal)
+
+
+def counting(reference: Reference, visible: Tensor | None, trusted: Tensor | None) -> Tensor | None:
+    """By how much the pixels (B, N) count: if they are ``visible`` (B, N), as their blocks are ``trusted``; None where
+    all do."""
+    if trusted is None:
+        return visible
+    share = trusted.to(reference.weight.dtype)[:, reference.grid.block]
+    return share if visible is None else share * visible
 
 
 def iterate(
-    reference: Reference, image: Tensor, interpolation: str, state: State, tolerance: float, most: int
+    reference: Reference,
+    image: Tensor,
+    interpolation: str,
+    state: State,
+    tolerance: float,
+    most: int,
+    trusted: Tensor | None = None,
 ) -> tuple[State, Tensor, Tensor | None]:
     """Gauss-Newton until every predicted error is below ``tolerance`` or ``most`` iterations are spent: the state, the
     last patches (B, N), and which of their pixels were in sight (B, N), None if the host knows that all were.
@@ -89,9 +116,10 @@ def iterate(
         g = sample_patch(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
         whole = on_cpu and inside(warp, reference.grid.box, size).all()
         visible = None if whole else inside(warp, reference.grid.pixels, size)
-        seen = reference if visible is None else restrict(reference, visible)
+        counted = counting(reference, visible, trusted)
+        seen = reference if counted is None else restrict(reference, counted)
         increment = seen.criterion.step(seen, g).to(state.pose.dtype)  # eq. (9)
-        if visible is not None:
+        if counted is not None:
             increment = torch.where(seen.weight.any(1, keepdim=True), increment, torch.nan)  # nothing in sight: no step
         state = advance(state, increment, reference.place.lever, busy)
     return state, g, visible

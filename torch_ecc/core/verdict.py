@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from math import inf
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +21,9 @@ from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution
 
+LEAST_COVERAGE = 0.5  # of the weight in sight must be believed: else what covers the template may be taken for it
+LEAST_INFORMATION = 0.2  # of that of all pixels in sight must be left in what is believed, in x, y and theta each
+AMBIGUITY_MARGIN = (1.5, 0.01)  # (a, b): a score s is as good as the best if 1 - s <= a (1 - s_best) + b
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
 NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
@@ -29,6 +33,7 @@ PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light i
 # The tests of ``decide`` in their order, and what the first one that fails tells.
 VERDICTS = (
     Status.OUT_OF_VIEW,  # too little of the template's weight lies in the frame
+    Status.LOST,  # too little of what lies there is believed
     Status.LOST,  # it does not look like the template
     Status.LOST,  # it looks like its negative
     Status.LOW_TEXTURE,  # the pose is not observable: sigma is too large
@@ -55,9 +60,9 @@ def judge(
     scatter = cluster_robust(reference, normal, total[:, 10:] / of_both.unsqueeze(1), variance)
     alias = interpolation_error(reference, axes, settings.interpolation)
     covariance = pose_covariance(reference, normal, variance, of_both / power, axes, scatter, alias)
-    visible = torch.ones_like(score) if normal is reference.normal else normal.total / reference.normal.total
+    visible, believed = seen_and_believed(reference, found)
     unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
-    status = decide(torch.stack((visible, match, found.gain, *unobservable, found.error, score), 1), settings)
+    status = decide(torch.stack((visible, believed, match, found.gain, *unobservable, found.error, score), 1), settings)
     rms = (error / normal.total).sqrt()
     if not on_cpu or max(status.tolist()) > Status.MAX_ITERATIONS:
         textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
@@ -67,15 +72,23 @@ def judge(
         rms = torch.where(unfitted, (total[:, 2] / normal.total.clamp(min=LEAST)).sqrt(), rms)
         good = Status.good(status)
         pose = torch.where(good[:, None], pose, start)
-        covariance = torch.where(good[:, None, None], covariance, _unknown(pose.dtype, pose.device))
+        covariance = torch.where(good[:, None, None], covariance, unknown(covariance))
     moved = pose - (start if origin is None else origin)
     return Estimate(
-        pose, moved, score, status, found.iterations, covariance, rms, _tracked(len(pose), pose.device).clone()
+        pose,
+        moved,
+        score,
+        status,
+        found.iterations,
+        covariance,
+        rms,
+        _tracked(len(pose), pose.device).clone(),
+        believed,
     )
 
 
 def decide(amounts: Tensor, settings: Settings) -> Tensor:
-    """Status codes (B,) int8 from the ``amounts`` (B, 7) that ``VERDICTS`` are about; the last is never passed."""
+    """Status codes (B,) int8 from the ``amounts`` (B, 8) that ``VERDICTS`` are about; the last is never passed."""
     sign, limit, codes = _limits(settings, amounts.dtype, amounts.device)
     first = (amounts * sign >= limit).to(torch.int8).argmin(1)  # NaN passes nothing
     return codes[first]
@@ -84,12 +97,37 @@ def decide(amounts: Tensor, settings: Settings) -> Tensor:
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Which way each amount counts, how much it has to be at least, and the status codes, (7,) each."""
-    least = settings.min_visible, settings.min_score, torch.finfo(dtype).tiny
+    """Which way each amount counts, how much it has to be at least, and the status codes, (8,) each."""
+    least = settings.min_visible, LEAST_COVERAGE, settings.min_score, torch.finfo(dtype).tiny
     most = LARGEST_SIGMA**2, NOISE_SHARE, settings.tolerance
     limit = torch.tensor([*least, *(-m for m in most), inf], dtype=dtype, device=device)
-    sign = torch.tensor([1, 1, 1, -1, -1, -1, 1], dtype=dtype, device=device)
+    sign = torch.tensor([1, 1, 1, 1, -1, -1, -1, 1], dtype=dtype, device=device)
     return sign, limit, torch.tensor(VERDICTS, dtype=torch.int8, device=device)
+
+
+def seen_and_believed(reference: Reference, found: Solution) -> tuple[Tensor, Tensor]:
+    """The share (B,) of the template's weight in sight, and of that what was believed: 0 if that holds next to none of
+    the information."""
+    normal, whole = found.normal, reference.normal
+    if found.trust is None:
+        all_of_it = torch.ones_like(found.error)
+        return all_of_it if normal is whole else normal.total / whole.total, all_of_it
+    seen = found.sums[:, 0].sum(1, dtype=normal.total.dtype)
+    visible, believed = seen / whole.total, normal.total / seen.clamp(min=LEAST)
+    information = (normal.bread.diagonal(dim1=1, dim2=2) / whole.bread.diagonal(dim1=1, dim2=2)).amin(1)
+    return visible, torch.where(information >= LEAST_INFORMATION * visible, believed, 0.0)
+
+
+def expected_score(reference: Reference) -> Tensor:
+    """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
+    noise, normal = reference.noise.level, reference.normal
+    return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
+
+
+def within_margin(score: Any, best: Any) -> Any:
+    """Whether a ``score`` s is as good as the ``best`` one, 1 - s <= a (1 - s_best) + b, any shape: bool."""
+    a, b = AMBIGUITY_MARGIN
+    return 1 - score <= a * (1 - best) + b
 
 
 def correlation(normal: Normal, total: Tensor) -> Tensor:
@@ -183,10 +221,14 @@ def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = 
     return normal.noise_share * (power if variance is None else torch.minimum(power, variance))
 
 
+def unknown(covariance: Tensor) -> Tensor:
+    """The ``covariance`` (..., 3, 3) of what was not found: (3, 3)."""
+    return _infinite(covariance.dtype, covariance.device)
+
+
 @lru_cache(maxsize=16)
 @torch.inference_mode(False)
-def _unknown(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The covariance of what was not found."""
+def _infinite(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.diag(torch.full((3,), inf, dtype=dtype, device=device))
 
 

@@ -32,17 +32,6 @@ CAMERA_START_S = 0.2137  # of the stage's clock; the sensors start with the stag
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Bench:
-    """Settings: microscope, light, ``gain`` of the camera, and the trackers by name."""
-
-    microscope: Microscope
-    light: Light | None = None
-    gain: float = 1.0
-    methods: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"ECC": {}})
-    seed: int = 0
-
-
 class Acquisition(NamedTuple):
     """Both records as ``Motion`` in um, um, rad: one per tracker, NaN where it was lost, and the sensors'.
 
@@ -60,31 +49,68 @@ class Acquisition(NamedTuple):
     first: Tensor
 
 
-def acquire(command: Tensor, bench: Bench, tick: Callable[[], None]) -> Acquisition:
-    """Run the stage along ``command`` (T, 3) um, um, rad at 1 kHz, film it at 100 Hz and read the sensors at 1024 Hz.
+@dataclass(frozen=True)
+class Bench:
+    """Settings: microscope, light, ``gain`` of the camera, and the trackers by name."""
 
-    The trackers' scale is known, the angle between image and stage is not. ``tick`` is called at every frame.
-    """
-    seconds: dict[str, float] = {}
-    with _timed(seconds, "stage"):
-        motion = Stage(StageSettings(floor=QUIET), seed=bench.seed).run(command, COMMAND_HZ)
-    with _timed(seconds, "sensors"):
-        sensors = Sensors(seed=bench.seed)
-        record = sensors.record(motion)
-        pose = sensors.settings.mounting.pose(record.distance_um)
-        read = Motion(record.times_s, torch.where(record.saturated.any(-1, keepdim=True), torch.nan, pose))
-    film = _film(motion, bench)
-    tracks, first = _track(film, bench, seconds, tick)
-    scale = Calibration(bench.microscope.um_per_px)
-    times = torch.arange(len(film), dtype=torch.float64) / bench.microscope.frame_rate_hz
-    center = torch.tensor([_middle(film.camera.size)])
-    truth = scale.to_physical(film.truth(center)[:, 0] - film.truth(center)[0, 0])
-    offset = float(bench.microscope.times(motion, start_s=CAMERA_START_S)[0] - record.times_s[0])
-    motions = {}
-    for name, track in tracks.items():
-        pose = scale.to_physical(track.displacement[:, 0])
-        motions[name] = Motion(times, torch.where(Status.good(track.status), pose, torch.nan))
-    return Acquisition(motions, read, Motion(times, truth), motion, offset, seconds, first)
+    microscope: Microscope
+    light: Light | None = None
+    gain: float = 1.0
+    methods: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"ECC": {}})
+    seed: int = 0
+
+    def frames(self, command: Tensor) -> int:
+        """How many ``acquire`` will take along ``command`` (T, 3), to within one."""
+        return int((len(command) / COMMAND_HZ - CAMERA_START_S) * self.microscope.frame_rate_hz)
+
+    def acquire(self, command: Tensor, tick: Callable[[], None]) -> Acquisition:
+        """Run the stage along ``command`` (T, 3) um, um, rad at 1 kHz, film it at 100 Hz, read the sensors at 1024 Hz.
+
+        The trackers' scale is known, the angle between image and stage is not. ``tick`` is called at every frame.
+        """
+        seconds: dict[str, float] = {}
+        with _timed(seconds, "stage"):
+            motion = Stage(StageSettings(floor=QUIET), seed=self.seed).run(command, COMMAND_HZ)
+        with _timed(seconds, "sensors"):
+            sensors = Sensors(seed=self.seed)
+            record = sensors.record(motion)
+            pose = sensors.settings.mounting.pose(record.distance_um)
+            read = Motion(record.times_s, torch.where(record.saturated.any(-1, keepdim=True), torch.nan, pose))
+        film, scale = self._film(motion), Calibration(self.microscope.um_per_px)
+        tracks, first = self._track(film, seconds, tick)
+        times = torch.arange(len(film), dtype=torch.float64) / self.microscope.frame_rate_hz
+        moved = film.truth(torch.tensor([_middle(film.camera.size)]))[:, 0]
+        truth = Motion(times, scale.to_physical(moved - moved[0]))
+        offset = float(self.microscope.times(motion, start_s=CAMERA_START_S)[0] - record.times_s[0])
+        motions = {}
+        for name, track in tracks.items():
+            pose = scale.to_physical(track.displacement[:, 0])
+            motions[name] = Motion(times, torch.where(Status.good(track.status), pose, torch.nan))
+        return Acquisition(motions, read, truth, motion, offset, seconds, first)
+
+    def _film(self, motion: StageMotion) -> Sequence:
+        """The lens' point-spread and the pixel's own width blur the analytic scene exactly, instead of its pixels."""
+        spread = (self.microscope.camera().blur_sigma ** 2 + 1 / 12) ** 0.5
+        settings = {"light": self.light, "gain": self.gain, "noise_sigma": NOISE}
+        camera = self.microscope.camera(blur_sigma=0.0, **settings)
+        scene = Window(micrograph(sigma=spread), (SIZE + 2 * AROUND,) * 2)
+        return self.microscope.film(scene, motion, start_s=CAMERA_START_S, camera=camera, seed=self.seed)
+
+    def _track(
+        self, film: Sequence, seconds: dict[str, float], tick: Callable[[], None]
+    ) -> tuple[dict[str, Track], Tensor]:
+        """Every method on the same frames, and the first frame (H, W)."""
+        first = film.batch(0, 1)[0, 0]
+        trackers = {name: tracker_of(first, **options) for name, options in self.methods.items()}
+        found: dict[str, list[Estimate]] = {name: [] for name in trackers}
+        for k in range(len(film)):
+            with _timed(seconds, "frames"):
+                frame = film.batch(k, k + 1)[0, 0]
+            for name, tracker in trackers.items():
+                with _timed(seconds, f"tracking, {name}"):
+                    found[name].append(tracker(frame))
+            tick()
+        return {name: Track.stack(estimates) for name, estimates in found.items()}, first
 
 
 def simulated_once(simulate: Callable[[bool, Advance], T]) -> Callable[[bool, Advance], T]:
@@ -129,43 +155,10 @@ def zeroed(motion: Motion, rest_s: float) -> Motion:
     return Motion(motion.time_s, motion.pose - valid(rest).mean(0))
 
 
-def frames_of(command: Tensor, bench: Bench) -> int:
-    """Frames that ``acquire`` will take, to within one."""
-    return int((len(command) / COMMAND_HZ - CAMERA_START_S) * bench.microscope.frame_rate_hz)
-
-
 def ease(u: Tensor) -> Tensor:
     """0 to 1 for u from 0 to 1, starting and ending without speed and acceleration; any shape."""
     u = u.clamp(0, 1)
     return u**3 * (10 - 15 * u + 6 * u**2)
-
-
-def _film(motion: StageMotion, bench: Bench) -> Sequence:
-    """The lens' point-spread and the pixel's own width blur the analytic scene exactly, instead of its pixels."""
-    microscope = bench.microscope
-    spread = (microscope.camera().blur_sigma ** 2 + 1 / 12) ** 0.5
-    settings = {"light": bench.light, "gain": bench.gain, "noise_sigma": NOISE}
-    camera = microscope.camera(blur_sigma=0.0, **settings)
-    side = SIZE + 2 * AROUND
-    scene = Window(micrograph(sigma=spread), (side, side))
-    return microscope.film(scene, motion, start_s=CAMERA_START_S, camera=camera, seed=bench.seed)
-
-
-def _track(
-    film: Sequence, bench: Bench, seconds: dict[str, float], tick: Callable[[], None]
-) -> tuple[dict[str, Track], Tensor]:
-    """Every method on the same frames, and the first frame (H, W)."""
-    first = film.batch(0, 1)[0, 0]
-    trackers = {name: tracker_of(first, **options) for name, options in bench.methods.items()}
-    found: dict[str, list[Estimate]] = {name: [] for name in trackers}
-    for k in range(len(film)):
-        with _timed(seconds, "frames"):
-            frame = film.batch(k, k + 1)[0, 0]
-        for name, tracker in trackers.items():
-            with _timed(seconds, f"tracking, {name}"):
-                found[name].append(tracker(frame))
-        tick()
-    return {name: Track.stack(estimates) for name, estimates in found.items()}, first
 
 
 def _middle(size: tuple[int, int]) -> tuple[float, float]:

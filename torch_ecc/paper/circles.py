@@ -7,20 +7,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ecc.paper.acquisition import (
-    COMMAND_HZ,
-    Acquisition,
-    Bench,
-    acquire,
-    ease,
-    frames_of,
-    microscope,
-    simulated_once,
-    zeroed,
-)
+from torch_ecc.paper.acquisition import COMMAND_HZ, Acquisition, Bench, ease, microscope, simulated_once, zeroed
 from torch_ecc.paper.errors import valid
 from torch_ecc.paper.result import Advance, counter
 from torch_ecc.records.calibration import Calibration
@@ -61,10 +52,10 @@ class Round(NamedTuple):
 @simulated_once
 def rounds(quick: bool, advance: Advance) -> list[Round]:
     """Both circles; simulated at the first call only. ``quick``: twice as fast, and a smaller part of the sensor."""
-    bench = Bench(microscope=microscope(quick, zoom=ZOOM))
-    commands = [command(radius, 5.0 if quick else 10.0) for radius in RADII]
-    tick = counter(sum(frames_of(c, bench) for c in commands), advance)
-    return [one_round(RADII[k], commands[k], replace(bench, seed=k), tick) for k in range(len(RADII))]
+    bench = Bench(microscope(quick, zoom=ZOOM))
+    commands = {radius: command(radius, 5.0 if quick else 10.0) for radius in RADII}
+    tick = counter(sum(map(bench.frames, commands.values())), advance)
+    return [one_round(*each, replace(bench, seed=k), tick) for k, each in enumerate(commands.items())]
 
 
 def command(radius: float, length_s: float) -> Tensor:
@@ -77,11 +68,12 @@ def command(radius: float, length_s: float) -> Tensor:
 
 def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None]) -> Round:
     """Simulate, track and analyse one circle."""
-    acquired = acquire(path, bench, tick)
+    acquired = bench.acquire(path, tick)
     rest = REST_S * len(path) / COMMAND_HZ
     track, sensors = zeroed(acquired.tracks["ECC"], rest), zeroed(acquired.sensors, rest)
     visual, sensed = portions(track)[1], portions(sensors)[1]
-    points = sensors.pose[sensed, :2]
+    cut = [Motion(m.time_s[rows], m.pose[rows]) for m, rows in ((track, visual), (sensors, sensed))]
+    points = cut[1].pose[:, :2]
     turn = Calibration(1.0, bench.microscope.axis_angle)
     turned, image = (turn.to_physical(m.pose) for m in (acquired.tracks["ECC"], acquired.truth))
     at = acquired.truth.time_s + acquired.offset_s
@@ -98,7 +90,7 @@ def one_round(radius: float, path: Tensor, bench: Bench, tick: Callable[[], None
         track,
         sensors,
         visual,
-        nearest_errors(_cut(track, visual), _cut(sensors, sensed)),
+        nearest_errors(*cut),
         align_records(track, sensors),
         line_angle(track, sensors),
         fit_circle(points),
@@ -121,18 +113,10 @@ def portions(motion: Motion) -> tuple[Tensor, Tensor, Tensor]:
 
 def line_angle(track: Motion, sensors: Motion) -> float:
     """Angle in rad from the image's axes to the stage's by straight lines, mean of the ways out and back."""
-    angles = []
-    for way in (0, 2):
-        image, stage = (fit_line(motion.pose[portions(motion)[way], :2]).angle for motion in (track, sensors))
-        angles.append(math.remainder(image - stage, math.tau))
-    return sum(angles) / 2
+    image, stage = ([fit_line(m.pose[way, :2]).angle for way in portions(m)[::2]] for m in (track, sensors))
+    return sum(math.remainder(a - b, math.tau) for a, b in zip(image, stage, strict=True)) / 2
 
 
 def common_angle(found: list[Round]) -> float:
     """``line_angle`` of all circles together, weighted by what lines of such length tell: their length squared."""
-    weights = [r.radius**2 for r in found]
-    return sum(w * r.line_angle for w, r in zip(weights, found, strict=True)) / sum(weights)
-
-
-def _cut(motion: Motion, rows: Tensor) -> Motion:
-    return Motion(motion.time_s[rows], motion.pose[rows])
+    return float(np.average([r.line_angle for r in found], weights=[r.radius**2 for r in found]))

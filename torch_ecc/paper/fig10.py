@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_ecc.paper.drawing import draw_box, draw_range, label_steps
 from torch_ecc.paper.errors import box, largest, rms
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
-from torch_ecc.paper.steps import Staircase, staircase
+from torch_ecc.paper.steps import LEVELS_DEG, Staircase, staircase
 from torch_ecc.plots.style import letter, new_figure
 
 METHODS = ("CDS", "ECC")
@@ -39,7 +39,7 @@ def run(quick: bool, advance: Advance) -> Experiment:
         ]
         rows.append((name, f"{whole:.5f}", f"{end:.5f}", f"{limit:g}", f"{extreme:.5f}", f"{most:g}"))
     header = ("", "rms", "largest box end", "paper", "largest error", "paper")
-    tables, picture = [Table("Mean errors of theta, deg", header, rows)], Picture("fig10", draw(errors, found), caption)
+    tables, picture = [Table("Mean errors of theta, deg", header, rows)], Picture("fig10", draw(errors), caption)
     return Experiment("fig10", "Fig. 10: mean errors", [picture], tables, records, REMARKS)
 
 
@@ -49,14 +49,13 @@ def errors_of(found: Staircase, name: str) -> list[Tensor]:
     return [dwells.errors[dwells.step == k, 2].rad2deg() for k in range(len(dwells.mean))]
 
 
-def draw(errors: dict[str, list[Tensor]], found: Staircase) -> Figure:
+def draw(errors: dict[str, list[Tensor]]) -> Figure:
     """(a) CDS and (b) ECC, each with its own scale."""
     figure = new_figure(11, 4.4)
     for k, (axes, (name, steps)) in enumerate(zip(figure.subplots(1, 2), errors.items(), strict=True)):
         for x, step in enumerate(steps, 1):
             draw_box(axes, x, step)
         draw_range(axes, MAIN_DEG[name])
-        label_steps(axes, found.levels_deg, rotation=45)
-        axes.set(xlabel="step (deg)", ylabel="mean error (deg)")
-        letter(axes, f"({'ab'[k]}) {name}")
+        label_steps(axes, LEVELS_DEG, rotation=45)
+        axes.set(title=letter(f"({'ab'[k]}) {name}"), xlabel="step (deg)", ylabel="mean error (deg)")
     return figure

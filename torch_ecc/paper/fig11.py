@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_ecc.paper.drawing import label_steps
 from torch_ecc.paper.errors import largest
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture
-from torch_ecc.paper.steps import LAMP, METHODS, staircase, step_table
+from torch_ecc.paper.steps import LAMP, LEVELS_DEG, METHODS, staircase, step_table
 from torch_ecc.plots.style import new_figure
 
 STYLES = {"ECC": ("o-", "#0072b2"), "ECC, gain": ("s--", "#56b4e9"), "SSD": ("^-", "#d55e00")}
@@ -33,22 +33,21 @@ def run(quick: bool, advance: Advance) -> Experiment:
         worse = float((errors[name].abs() >= errors["SSD"].abs()).sum())
         limit = 0.0 if name == "ECC" else None
         records.append(Number(f"fig11 steps at which {name} is not better than SSD", worse, "", tolerance=limit))
-    levels, noise = found.levels_deg[1:], found.dwells["ECC"].standard_error[1:, 2].rad2deg()
-    table = step_table("Absolute errors of theta, deg", levels, errors | {"standard error": noise}, first=1)
-    picture = Picture("fig11", draw(errors, levels), caption)
+    noise = found.dwells["ECC"].standard_error[1:, 2].rad2deg()
+    table = step_table("Absolute errors of theta, deg", errors | {"standard error": noise}, first=1)
+    picture = Picture("fig11", draw(errors), caption)
     return Experiment("fig11", "Fig. 11: absolute errors", [picture], [table], records, REMARKS)
 
 
-def draw(errors: dict[str, Tensor], levels_deg: Tensor) -> Figure:
+def draw(errors: dict[str, Tensor]) -> Figure:
     """Errors over the steps."""
     figure = new_figure(8.5, 4.4)
     axes = figure.subplots()
-    steps = range(1, len(levels_deg) + 1)
     for name, values in errors.items():
         marks, colour = STYLES[name]
-        axes.plot(steps, values, marks, color=colour, ms=4, label=name)
+        axes.plot(range(1, len(values) + 1), values, marks, color=colour, ms=4, label=name)
     axes.axhline(0, color="0.6", lw=0.8)
-    label_steps(axes, levels_deg)
+    label_steps(axes, LEVELS_DEG[1:])
     axes.set(xlabel="step (deg), up and down", ylabel="absolute error (deg)")
     axes.legend()
     return figure

@@ -9,37 +9,44 @@ from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, 
 from torch_ecc.paper.servo_trials import Single, error_cells, single
 from torch_ecc.servo.record import decay_rate
 
-CLEAN: dict[str, Any] = {
-    "camera": {"noise_sigma": 0.0, "bits": "float"},
-    "substrate": {"x": {"step": 0.0}, "y": {"step": 0.0}},
-    "start": {"substrate": [215.0, 270.0, 15.0]},
-}
-WRONG: dict[str, dict[str, Any]] = {
-    "as it is": {},
-    "scale 20 % too large, axes 5 deg off": {"belief": {"um_per_px": 0.33, "axis_angle_deg": 5.0}},
-    "scale 20 % too small, axes -5 deg off": {"belief": {"um_per_px": 0.22, "axis_angle_deg": -5.0}},
-    "axis of rotation unknown": {"belief": {"axis": [0.0, 0.0]}},
-    "all three, learning (Broyden)": {
-        "belief": {"um_per_px": 0.33, "axis_angle_deg": 5.0, "axis": [0.0, 0.0]},
-        "control": {"learn": 0.3},
-    },
-    "camera 3 frames late, unknown": {"microscope": {"delay": 3}},
-    "camera 3 frames late, known": {"microscope": {"delay": 3}, "control": {"delay": 3}},
-}
 GAIN, SCALE = 2.0, 0.5  # 1/s; px of the quick runs over those of the others
 REMARKS = ("The paper shows the curves without numbers: they rise at once and fall to zero as exponentials, as here.",)
 QUICK = ("as it is", "scale 20 % too large, axes 5 deg off")
 
 
+def clean(scale: float) -> dict[str, Any]:
+    """Neither noise nor steps of the stage, which leaves a decay that can be measured."""
+    return {
+        "camera": {"noise_sigma": 0.0, "bits": "float"},
+        "substrate": {"x": {"step": 0.0}, "y": {"step": 0.0}},
+        "start": {"substrate": [scale * 215.0, scale * 270.0, 15.0]},
+    }
+
+
+def wrong(scale: float) -> dict[str, dict[str, Any]]:
+    """What the controller may get wrong, by name; the first is right."""
+    large, small = ({"um_per_px": um / scale, "axis_angle_deg": deg} for um, deg in ((0.33, 5.0), (0.22, -5.0)))
+    return {
+        "as it is": {},
+        "scale 20 % too large, axes 5 deg off": {"belief": large},
+        "scale 20 % too small, axes -5 deg off": {"belief": small},
+        "axis of rotation unknown": {"belief": {"axis": [0.0, 0.0]}},
+        "all three, learning (Broyden)": {"belief": large | {"axis": [0.0, 0.0]}, "control": {"learn": 0.3}},
+        "camera 3 frames late, unknown": {"microscope": {"delay": 3}},
+        "camera 3 frames late, known": {"microscope": {"delay": 3}, "control": {"delay": 3}},
+    }
+
+
 def run(quick: bool, advance: Advance) -> Experiment:
     """A run without noise, and one for each wrong belief; ``quick``: only one of these, at half the resolution."""
-    scale, names = (SCALE, QUICK) if quick else (1.0, tuple(WRONG))
-    every, tick = [], counter(1 + len(names), advance)
-    for changes in (CLEAN, *(WRONG[name] for name in names)):
-        every.append(single(scale, **_changes(changes, scale)))
+    scale = SCALE if quick else 1.0
+    cases = {name: changes for name, changes in wrong(scale).items() if not quick or name in QUICK}
+    every, tick = [], counter(1 + len(cases), advance)
+    for changes in (clean(scale), *cases.values()):
+        every.append(single(scale, **changes | {"control": {"gain": GAIN} | changes.get("control", {})}))
         tick()
-    (clean, *_), runs = every, dict(zip(names, every[1:], strict=True))
-    rates = decay_rate(clean.result.log.time, clean.result.log.error, largest=0.8, smallest=0.005)
+    (still, *_), runs = every, dict(zip(cases, every[1:], strict=True))
+    rates = decay_rate(still.result.log.time, still.result.log.error, largest=0.8, smallest=0.005)
     off = 100 * (rates / GAIN - 1).abs()
     usual = runs["as it is"]
     records = [
@@ -55,7 +62,7 @@ def run(quick: bool, advance: Advance) -> Experiment:
     velocities = draw_velocities([usual.result.log], ["Substrate"])
     pictures = [
         Picture("fig13", velocities, "Commanded velocities of the substrate's axes."),
-        Picture("fig13_decay", draw_errors([clean.result.log], ["Without noise"], GAIN), "Errors without noise."),
+        Picture("fig13_decay", draw_errors([still.result.log], ["Without noise"], GAIN), "Errors without noise."),
     ]
     rows = [
         (name, r.result.ending.name, f"{float(r.result.log.time[-1]):.2f}", *error_cells(r.error))
@@ -70,15 +77,3 @@ def _last(run: Single) -> float:
     """Largest share that the velocity of any axis has of its largest one, in the frame before it is found aligned."""
     velocity = run.result.log.velocity.abs()
     return float((velocity[-2] / velocity.amax(0)).max())
-
-
-def _changes(changes: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
-    """The same changes for pictures of another scale (lengths in px, and um per px), and lambda."""
-    tables = {name: dict(table) for name, table in changes.items()}
-    tables["control"] = {"gain": GAIN} | tables.get("control", {})
-    if "start" in tables:
-        x, y, deg = tables["start"]["substrate"]
-        tables["start"]["substrate"] = [scale * x, scale * y, deg]
-    if "um_per_px" in tables.get("belief", {}):
-        tables["belief"]["um_per_px"] /= scale
-    return tables

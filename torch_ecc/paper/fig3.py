@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torch_ecc.core.pose import compose
@@ -33,16 +32,6 @@ PANELS = (
 Errors = dict[str, dict[str, Tensor]]  # by camera and method: (F, 3) px, px, deg
 
 
-class Spread(NamedTuple):
-    """Largest errors (P, methods, 2) px, deg of P templates, the paper's first and then others, with UI.
-
-    ``first``: cut from the first frame; ``reflected``: cut from the evenly lit image.
-    """
-
-    first: Tensor
-    reflected: Tensor
-
-
 def run(quick: bool, advance: Advance) -> Experiment:
     """Track and draw. ``quick``: half a cycle (the other half goes back the same way), the text's amplitudes only."""
     motions = (scheme.TEXT,) if quick else (scheme.TEXT, scheme.CAPTION)
@@ -51,7 +40,7 @@ def run(quick: bool, advance: Advance) -> Experiment:
     tick = counter(sum(map(len, paths.values())) + count * poses, advance)
     found = {motion: sequence_errors(path, tick) for motion, path in paths.items()}
     spread = template_errors(count, poses, tick)
-    pictures = [*(_curves(motion, e) for motion, e in found.items()), _spread(spread)]
+    pictures = [*(curves(motion, e) for motion, e in found.items()), spread_of_templates(spread)]
     tables = [_table(motion, e) for motion, e in found.items()] + [_spread_table(spread)]
     records = [r for motion, e in found.items() for r in _records(motion, e)]
     title = "Fig. 3: uneven illumination"
@@ -72,7 +61,7 @@ def sequence_errors(path: Tensor, tick: Callable[[], None]) -> Errors:
     followers: dict[str, dict[str, Follower]] = {}
     found: dict[str, dict[str, list[Tensor]]] = {c: {m: [] for m in METHODS} for c in views}
     for pose in path.split(1):
-        clean = scheme.Kept(scene, scene.render(pose, scheme.FRAME))
+        clean = scheme.Kept(scene.render(pose, scheme.FRAME))
         for name, camera in views.items():
             frame = camera.capture(clean, pose)
             if name not in followers:
@@ -84,13 +73,14 @@ def sequence_errors(path: Tensor, tick: Callable[[], None]) -> Errors:
     return {c: {m: errors(torch.cat(poses), truth) for m, poses in by.items()} for c, by in found.items()}
 
 
-def template_errors(count: int, poses: int, tick: Callable[[], None]) -> Spread:
-    """``count`` templates, the paper's and others, aligned from the truth at ``poses`` poses of the text's cycle."""
+def template_errors(count: int, poses: int, tick: Callable[[], None]) -> Tensor:
+    """Largest errors (2, ``count``, methods, 2) px, deg with UI of the paper's template, then of others: cut from the
+    first frame, and from the evenly lit image. Aligned from the truth at ``poses`` poses of the text's cycle."""
     scene, (even, lit), middle = scheme.scene(), cameras().values(), scheme.cut_reflected()
     path = scheme.TEXT.path()[:: scheme.TEXT.points // poses][:poses]
     spots = REACH * (torch.rand(count, 2, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64) - 0.5)
     spots[0] = 0
-    rows: tuple[list[Tensor], list[Tensor]] = ([], [])
+    found = []
     for spot in spots:
         shift = torch.cat((-spot, spot.new_zeros(1)))
         still = even.capture(scene, compose(middle.pose, shift)[None])
@@ -99,50 +89,36 @@ def template_errors(count: int, poses: int, tick: Callable[[], None]) -> Spread:
             frames.append(lit.capture(scene, compose(pose, shift[None])))
             tick()
         sequence = torch.cat(frames)
-        for row, cut, image in ((rows[0], scheme.cut_first(path), sequence[:1]), (rows[1], middle, still)):
-            row.append(_align_all(cut.template(image), sequence, cut.truth(path)))
-    return Spread(*(torch.stack(row) for row in rows))
+        cuts = ((scheme.cut_first(path), sequence[:1]), (middle, still))
+        found.append([_align_all(cut.template(image), sequence, cut.truth(path)) for cut, image in cuts])
+    return torch.tensor(found).transpose(0, 1)
 
 
-def _align_all(template: Tensor, frames: Tensor, truth: Tensor) -> Tensor:
-    """Largest errors (methods, 2) px, deg with one template over frames (F, 1, h, w), started at the truth (F, 3)."""
+def _align_all(template: Tensor, frames: Tensor, truth: Tensor) -> list[tuple[float, float]]:
+    """Largest errors px, deg of each method with one template over frames (F, 1, h, w), from the truth (F, 3) on."""
     many = template.expand(len(frames), -1, -1, -1)
-    return torch.tensor([by_unit(largest(errors(m.start(many, truth).track(frames), truth))) for m in METHODS.values()])
+    return [by_unit(largest(errors(m.start(many, truth).track(frames), truth))) for m in METHODS.values()]
 
 
-def _curves(motion: scheme.Harmonic, found: Errors) -> Picture:
-    name = "fig3" if motion == scheme.TEXT else "fig3_caption"
-    caption = (
-        f"Errors along eq. (11), {motion}. First row ECC without and with uneven illumination, second row SSD; "
-        "the vertical scale of a component is the same without and with light. The numbers are the largest errors."
-    )
-    return Picture(name, draw_curves(found), caption)
-
-
-def _spread(spread: Spread) -> Picture:
-    panels = {"(a) templates from the first frame": spread.first, "(b) from the evenly lit image": spread.reflected}
-    caption = (
-        "How much depends on the template: largest errors with uneven light of the template in the middle of the "
-        f"micrograph (diamond) and of {len(spread.first) - 1} at random places (dots), text's amplitudes."
-    )
-    return Picture("fig3_templates", draw_templates(panels), caption)
-
-
-def draw_curves(found: Mapping[str, Mapping[str, Tensor]]) -> Figure:
-    """Errors (F, 3) px, px, deg of every method: four panels of three components, laid out as the paper's Fig. 3."""
+def curves(motion: scheme.Harmonic, found: Errors) -> Picture:
+    """Errors of every method: four panels of three components, laid out as the paper's Fig. 3."""
     figure = new_figure(11, 9)
     parts: Any = figure.subfigures(2, 2)
     for part, (title, camera, methods) in zip(parts.flat, PANELS, strict=True):
         rows = part.subplots(3, 1, sharex=True)
-        letter(rows[0], title)
+        rows[0].set_title(letter(title))
         for k, axes in enumerate(rows):
             _draw_component(axes, {m: found[camera][m][:, k] for m in methods})
-            axes.set_ylabel(f"{COMPONENTS[k]} error ({UNITS[k]})")
             values = torch.stack([by_method[m][:, k] for by_method in found.values() for m in methods])
             low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
-            axes.set_ylim(low - 0.15 * (high - low), high + 0.4 * (high - low))
+            room = (low - 0.15 * (high - low), high + 0.4 * (high - low))
+            axes.set(ylabel=f"{COMPONENTS[k]} error ({UNITS[k]})", ylim=room)
         rows[-1].set_xlabel("frame j")
-    return figure
+    caption = (
+        f"Errors along eq. (11), {motion}. First row ECC without and with uneven illumination, second row SSD; "
+        "the vertical scale of a component is the same without and with light. The numbers are the largest errors."
+    )
+    return Picture("fig3" if motion == scheme.TEXT else "fig3_caption", figure, caption)
 
 
 def _draw_component(axes: Axes, curves: Mapping[str, Tensor]) -> None:
@@ -154,13 +130,13 @@ def _draw_component(axes: Axes, curves: Mapping[str, Tensor]) -> None:
         axes.text(0.01 + 0.25 * k, 0.86, text, color=style.colour, transform=axes.transAxes, fontsize=8)
 
 
-def draw_templates(panels: Mapping[str, Tensor]) -> Figure:
-    """Largest errors (P, methods, 2) px, deg of P templates, one column per method: the first as a diamond, the others
-    as dots with their median."""
+def spread_of_templates(spread: Tensor) -> Picture:
+    """``template_errors``, one column per method: the first as a diamond, the others as dots with their median."""
     figure = new_figure(11, 6)
-    grid = figure.subplots(2, len(panels), sharex=True, sharey="row", squeeze=False)
-    for column, (title, values) in zip(grid.T, panels.items(), strict=True):
-        letter(column[0], title)
+    grid = figure.subplots(2, 2, sharex=True, sharey="row")
+    titles = ("(a) templates from the first frame", "(b) from the evenly lit image")
+    for column, title, values in zip(grid.T, titles, spread, strict=True):
+        column[0].set_title(letter(title))
         for k, axes in enumerate(column):
             _dots(axes, values[..., k])
             for method, limits in PAPER.items():
@@ -173,7 +149,11 @@ def draw_templates(panels: Mapping[str, Tensor]) -> Figure:
     handles, labels = grid[0, 0].get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=3)
-    return figure
+    caption = (
+        "How much depends on the template: largest errors with uneven light of the template in the middle of the "
+        f"micrograph (diamond) and of {spread.shape[1] - 1} at random places (dots), text's amplitudes."
+    )
+    return Picture("fig3_templates", figure, caption)
 
 
 def _dots(axes: Axes, values: Tensor) -> None:
@@ -197,13 +177,13 @@ def _table(motion: scheme.Harmonic, found: Errors) -> Table:
     return Table(f"Largest errors, {motion}", header, rows, note)
 
 
-def _spread_table(spread: Spread) -> Table:
+def _spread_table(spread: Tensor) -> Table:
     rows = []
     for k, method in enumerate(METHODS.values()):
-        middle = "{:.4f} px, {:.4f} deg".format(*spread.reflected[0, k].tolist())
+        middle = "{:.4f} px, {:.4f} deg".format(*spread[1, 0, k].tolist())
         rows.append((method.label, middle, *(_range(values[1:, k, unit]) for values in spread for unit in (0, 1))))
     header = ("method", "middle, evenly lit", "elsewhere, first frame, px", "deg", "elsewhere, evenly lit, px", "deg")
-    title = f"Largest errors with UI by template: the middle one, and {len(spread.first) - 1} elsewhere"
+    title = f"Largest errors with UI by template: the middle one, and {spread.shape[1] - 1} elsewhere"
     note = (
         "Evenly lit: cut from the image without UI, as the paper's text has it (Fig. 2(b)). Elsewhere: median "
         "(smallest to largest). Aligned from the truth at every pose."
@@ -216,28 +196,25 @@ def _range(values: Tensor) -> str:
 
 
 def _records(motion: scheme.Harmonic, found: Errors) -> list[Number]:
-    records = []
+    records, about = [], f"fig3 {motion.degrees:g} deg,"
     for camera, by_method in found.items():
+        lit = camera == "with UI"
         for name, error in by_method.items():
-            limit = LIMITS.get(name) if camera == "with UI" else EVEN_LIMIT if name in LIMITS else None
-            paper = PAPER.get(name) if camera == "with UI" else None
+            limit = (LIMITS[name] if lit else EVEN_LIMIT) if name in LIMITS else None
+            paper = PAPER.get(name) if lit else None
             for k, (value, unit) in enumerate(zip(by_unit(largest(error)), ("px", "deg"), strict=True)):
-                label = f"fig3 {motion.degrees:g} deg, {name}, {camera}, largest {'theta' if k else 'x, y'}"
+                label = f"{about} {name}, {camera}, largest {'theta' if k else 'x, y'}"
                 records.append(Number(label, value, unit, tolerance=limit and limit[k], paper=paper and paper[k]))
-        if camera == "with UI":
-            ratio = float(largest(by_method["ref34"])[2] / largest(by_method["gain"])[2])
-            label = f"fig3 {motion.degrees:g} deg, theta error of ref34 over that of gain, with UI"
-            records.append(Number(label, ratio, "1", "higher", 2.0, PAPER["ref34"][1] / PAPER["gain"][1]))
-    return records
+    ratio = float(largest(found["with UI"]["ref34"])[2] / largest(found["with UI"]["gain"])[2])
+    label = f"{about} theta error of ref34 over that of gain, with UI"
+    return [*records, Number(label, ratio, "1", "higher", 2.0, PAPER["ref34"][1] / PAPER["gain"][1])]
 
 
-def _remarks(by_motion: dict[scheme.Harmonic, Errors], spread: Spread) -> list[str]:
+def _remarks(by_motion: dict[scheme.Harmonic, Errors], spread: Tensor) -> list[str]:
     found = by_motion[scheme.TEXT]
     lit = {name: by_unit(largest(error)) for name, error in found["with UI"].items()}
-    least, most = {}, {}
-    for k, name in enumerate(METHODS):
-        both = torch.cat((spread.first[1:, k], spread.reflected[1:, k]))
-        least[name], most[name] = both.amin(0).tolist(), both.amax(0).tolist()
+    elsewhere = dict(zip(METHODS, spread[:, 1:].flatten(0, 1).unbind(1), strict=True))  # (n, 2) px, deg by method
+    least, most = ({m: f(e, 0).tolist() for m, e in elsewhere.items()} for f in (torch.amin, torch.amax))
     remarks = [
         f"With uneven light the paper's ECC (gain) errs by at most {lit['gain'][0]:.3f} px and {lit['gain'][1]:.3f} "
         f"deg here (paper: 0.05 and 0.05), ref. 34 by {lit['ref34'][0]:.3f} px and {lit['ref34'][1]:.3f} deg (paper: "
@@ -261,18 +238,12 @@ def _remarks(by_motion: dict[scheme.Harmonic, Errors], spread: Spread) -> list[s
         "numbers for that case.",
     ]
     if scheme.CAPTION in by_motion:
-        ratio = [float(largest(by_motion[scheme.CAPTION]["with UI"][m])[2]) for m in ("ref34", "gain")]
+        turned = {m: float(largest(e)[2]) for m, e in by_motion[scheme.CAPTION]["with UI"].items()}
+        factor = float((elsewhere["ref34"] / elsewhere["gain"])[:, 1].quantile(0.5))
         remarks.append(
             "With the amplitudes of Fig. 2's caption the first frame, and the template that is cut upright from it, "
-            f"lies at another angle. On that template SSD is not worse in theta: ref. 34 {ratio[0]:.4f} deg, gain "
-            f"{ratio[1]:.4f} deg. Over the templates cut elsewhere it is worse by a median factor of "
-            f"{_theta_factor(spread):.1f}."
+            f"lies at another angle. On that template SSD is not worse in theta: ref. 34 {turned['ref34']:.4f} deg, "
+            f"gain {turned['gain']:.4f} deg. Over the templates cut elsewhere it is worse by a median factor of "
+            f"{factor:.1f}."
         )
     return remarks
-
-
-def _theta_factor(spread: Spread) -> float:
-    """Theta error of ref. 34 over that of gain, median over the templates cut elsewhere."""
-    theta = torch.cat((spread.first[1:, :, 1], spread.reflected[1:, :, 1]))
-    names = list(METHODS)
-    return float((theta[:, names.index("ref34")] / theta[:, names.index("gain")]).quantile(0.5))

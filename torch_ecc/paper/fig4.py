@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import chain
 from typing import NamedTuple
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torch_ecc.core.pose import rotation
@@ -63,24 +63,12 @@ def run(quick: bool, advance: Advance) -> Experiment:
     cuts = {"noise-free": scheme.cut_reflected()} | ({} if quick else {"noisy": scheme.cut_first(path)})
     tick = counter(len(cuts) * len(poses), advance)
     found = {kind: trials(path, poses, cut, tick) for kind, cut in cuts.items()}
-    pictures = [_picture(kind, noisy) for kind, noisy in found.items()]
-    tables = [_table(kind, noisy) for kind, noisy in found.items()]
-    records = [record for kind, noisy in found.items() for record in _records(kind, noisy)]
-    return Experiment("fig4", "Fig. 4: image noise", pictures, tables, records, _remarks(found), SEED)
+    pictures = [boxes(kind, noisy) for kind, noisy in found.items()]
+    tables, records = zip(*(_numbers(kind, noisy) for kind, noisy in found.items()), strict=True)
+    return Experiment("fig4", "Fig. 4: image noise", pictures, tables, [*chain(*records)], _remarks(found), SEED)
 
 
-def _picture(kind: str, found: dict[str, Noisy]) -> Picture:
-    caption = (
-        f"Template cut from {FROM[kind]}. (a) ECC (linear), (b) SSD (ref. 34), conventions of the paper's Fig. 4: box "
-        "from the lower to the upper quartile, red line the mean, dashed line to the smallest and largest value that "
-        "is no outlier (1.5 box heights), + outliers. Grey band: the box of an estimator at the Cramer-Rao bound. "
-        f"Dotted: box and maximum that the paper's text states, {BOX:g} and {WHISKER:g} px."
-    )
-    name = "fig4" if kind == "noise-free" else "fig4_noisy_template"
-    return Picture(name, draw(found), caption)
-
-
-def draw(found: dict[str, Noisy]) -> Figure:
+def boxes(kind: str, found: dict[str, Noisy]) -> Picture:
     """Boxes of each component by variance, ECC above SSD."""
     figure = new_figure(11, 6.4)
     grid = figure.subplots(2, 3, sharex=True, sharey="col")
@@ -94,9 +82,14 @@ def draw(found: dict[str, Noisy]) -> Figure:
                 draw_range(axes, limit)
             names = [rf"$\sigma_{x}^2 = {variance}$" for x, variance in enumerate(found, 1)]
             axes.set_xticks(range(1, len(names) + 1), names)
-            axes.set_ylabel(f"{COMPONENTS[k]} error ({UNITS[k]})")
-            letter(axes, f"{title}: {COMPONENTS[k]}")
-    return figure
+            axes.set(title=letter(f"{title}: {COMPONENTS[k]}"), ylabel=f"{COMPONENTS[k]} error ({UNITS[k]})")
+    caption = (
+        f"Template cut from {FROM[kind]}. (a) ECC (linear), (b) SSD (ref. 34), conventions of the paper's Fig. 4: box "
+        "from the lower to the upper quartile, red line the mean, dashed line to the smallest and largest value that "
+        "is no outlier (1.5 box heights), + outliers. Grey band: the box of an estimator at the Cramer-Rao bound. "
+        f"Dotted: box and maximum that the paper's text states, {BOX:g} and {WHISKER:g} px."
+    )
+    return Picture("fig4" if kind == "noise-free" else "fig4_noisy_template", figure, caption)
 
 
 def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None]) -> dict[str, Noisy]:
@@ -107,14 +100,14 @@ def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None
     """
     scene, truth = scheme.scene(), cut.truth(path)
     noisy = bool((cut.pose == path[0]).all())
-    still = scheme.Kept(scene, scene.render(cut.pose[None], scheme.FRAME))
+    still = scheme.Kept(scene.render(cut.pose[None], scheme.FRAME))
     many = torch.zeros(DRAWS, dtype=torch.long)
     bound = in_degrees(cramer_rao(scene, (scheme.SIZE, scheme.SIZE), 2.0 if noisy else 1.0, cut.place()))
     cameras = {v: Camera(size=scheme.FRAME, noise_sigma=noise_sigma(v)) for v in VARIANCES}
     found: dict[float, dict[str, list[Tensor]]] = {v: {m: [] for m in COMPARED} for v in VARIANCES}
     followers: dict[str, Follower] = {}
     for k in poses.tolist():
-        clean = scheme.Kept(scene, scene.render(path[k : k + 1], scheme.FRAME))
+        clean = scheme.Kept(scene.render(path[k : k + 1], scheme.FRAME))
         for number, (v, camera) in enumerate(cameras.items()):
             frames = camera.capture(clean, path[k + many], seed=SEED + number, first=k * DRAWS)
             if noisy or not followers:
@@ -132,30 +125,16 @@ def trials(path: Tensor, poses: Tensor, cut: scheme.Cut, tick: Callable[[], None
     }
 
 
-def _table(kind: str, found: dict[str, Noisy]) -> Table:
-    rows = []
+def _numbers(kind: str, found: dict[str, Noisy]) -> tuple[Table, list[Number]]:
+    """The numbers of every variance and method as a table, and with what the paper and the bound have beside them."""
+    rows, records = [], []
     for variance, noisy in found.items():
         for name in COMPARED:
             (side, turn), (far, far_turn) = noisy.extent(name)
             ratios = " ".join(cells(noisy.ratio(name), ".2f"))
             rows.append((variance, METHODS[name].label, *cells((side, far, turn, far_turn), ".4f"), ratios))
-    rows.append(("all", "paper, ECC and SSD", f"{BOX:g}", f"{WHISKER:g}", "", "", ""))
-    header = ("variance", "method", "box, px", "largest, px", "box, deg", "largest, deg", "rms / bound x y theta")
-    count = len(next(iter(found.values())).theta)
-    note = (
-        f"{count} draws each. Box: the farther of the two quartiles from zero, of the larger of x and y. The paper's "
-        "numbers are those of its text; it gives none for theta."
-    )
-    return Table(f"Template cut from {FROM[kind]}", header, rows, note)
-
-
-def _records(kind: str, found: dict[str, Noisy]) -> list[Number]:
-    records = []
-    for variance, noisy in found.items():
-        for name in COMPARED:
             label = f"fig4 {kind} template, variance {variance}, {name}"
             limit = RATIO_LIMIT if name == "linear" else None
-            (side, turn), (far, far_turn) = noisy.extent(name)
             records += [
                 Number(f"{label}, rms over the bound", noisy.over(name), "1", tolerance=limit),
                 Number(f"{label}, box of x, y", side, "px", paper=BOX),
@@ -163,7 +142,14 @@ def _records(kind: str, found: dict[str, Noisy]) -> list[Number]:
                 Number(f"{label}, box of theta", turn, "deg"),
                 Number(f"{label}, largest of theta", far_turn, "deg"),
             ]
-    return records
+    rows.append(("all", "paper, ECC and SSD", f"{BOX:g}", f"{WHISKER:g}", "", "", ""))
+    header = ("variance", "method", "box, px", "largest, px", "box, deg", "largest, deg", "rms / bound x y theta")
+    count = len(next(iter(found.values())).theta)
+    note = (
+        f"{count} draws each. Box: the farther of the two quartiles from zero, of the larger of x and y. The paper's "
+        "numbers are those of its text; it gives none for theta."
+    )
+    return Table(f"Template cut from {FROM[kind]}", header, rows, note), records
 
 
 def _remarks(found: dict[str, dict[str, Noisy]]) -> list[str]:

@@ -83,15 +83,13 @@ def draw(found: list[Round]) -> Figure:
     _draw_space(space, found)
     plane = rows[0].add_axes((0.53, 0.12, 0.45, 0.8))
     _draw_plane(plane, found, legend=True)
-    plane.set_aspect("equal", "datalim")
-    letter(plane, "(b) in the plane")
+    plane.set(title=letter("(b) in the plane"), aspect="equal", adjustable="datalim")
     close, parts = rows[1].subplots(1, 2, width_ratios=(1, 1.25))
     _draw_plane(close, found, legend=False)
     big = found[-1]
     middle = big.radius * 0.79
-    close.set(xlim=(middle - 1.6, middle + 0.9), ylim=(-1.1, 1.1))
+    close.set(title=letter("(c) enlarged part of (b)"), xlim=(middle - 1.6, middle + 0.9), ylim=(-1.1, 1.1))
     plane.add_patch(Rectangle((middle - 1.6, -1.1), 2.5, 2.2, fill=False, color="0.4", lw=0.8))
-    letter(close, "(c) enlarged part of (b)")
     _draw_parts(parts, found)
     return figure
 
@@ -102,7 +100,7 @@ def _draw_space(axes: Any, found: list[Round]) -> None:  # matplotlib does not t
         axes.plot(*r.track.pose[:, :2].T, r.track.pose[:, 2].rad2deg(), ".", ms=1.5, color=VISION[k])
     axes.set(xlabel="x (um)", ylabel="y (um)", zlabel=r"$\theta$ (deg)", zlim=(-0.12, 0.12))
     axes.view_init(elev=28, azim=-55)
-    letter(axes, "(a) in three dimensions")
+    axes.set_title(letter("(a) in three dimensions"), loc="left")  # 3-D axes know no setting for that
 
 
 def _draw_plane(axes: Axes, found: list[Round], *, legend: bool) -> None:
@@ -127,7 +125,7 @@ def _draw_parts(axes: Axes, found: list[Round]) -> None:
             axes.plot(r.track.time_s, r.track.pose[:, i], dashes, color=VISION[k], label=label)
         turn.plot(r.track.time_s, 1e6 * r.track.pose[:, 2], color="0.55", lw=0.5, alpha=0.7)
     reach = 1.25 * found[-1].radius
-    axes.set(xlabel="time (s)", ylabel="x, y (um)", ylim=(-reach, 1.4 * reach))
+    title = letter("(d) components of the vision method")
+    axes.set(title=title, xlabel="time (s)", ylabel="x, y (um)", ylim=(-reach, 1.4 * reach))
     turn.set(ylabel=r"$\theta$ (urad), grey", ylim=(-2400, 3360))
     axes.legend(ncols=4, loc="upper center", fontsize=8)
-    letter(axes, "(d) components of the vision method")

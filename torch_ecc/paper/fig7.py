@@ -91,4 +91,4 @@ def _draw(axes: Axes, time: Tensor, errors: Tensor, title: str) -> None:
         axes.plot(time, errors[:, i], color=COLOURS[i], lw=0.8, label=COMPONENTS[i])
     most = largest(valid(errors))[:2].max()
     axes.text(0.99, 0.02, f"largest {most:.2g}", transform=axes.transAxes, ha="right", va="bottom", fontsize=8.5)
-    letter(axes, title)
+    axes.set_title(letter(title))

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from torch_ecc.paper.acquisition import times
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture
-from torch_ecc.paper.steps import METHODS, Staircase, staircase, step_table
+from torch_ecc.paper.steps import HIGHEST, METHODS, Staircase, staircase, step_table
 from torch_ecc.plots.style import new_figure
 
 CDS, ECC = "#d55e00", "#0072b2"
@@ -33,7 +33,7 @@ def run(quick: bool, advance: Advance) -> Experiment:
         Number("fig8 clock offset by the joint estimate, error", clock, "us", tolerance=1000.0),
     ]
     means = {name: found.mean_deg(name) for name in ("CDS", *METHODS)}
-    tables = [step_table("Mean theta of each step, deg", found.levels_deg, means), times({"staircase": found.acquired})]
+    tables = [step_table("Mean theta of each step, deg", means), times({"staircase": found.acquired})]
     picture = Picture("fig8", draw(found), caption)
     return Experiment("fig8", "Fig. 8: angular trajectory", [picture], tables, records, REMARKS)
 
@@ -48,9 +48,8 @@ def draw(found: Staircase) -> Figure:
     for panel in (axes, inset):
         panel.plot(sensors.time_s, sensors.pose[:, 2].rad2deg(), color=CDS, lw=1.1, label="CDS")
         panel.plot(*ecc, color=ECC, lw=0.7, label="ECC")
-    top = int(found.levels_deg.argmax())
-    start, end = found.windows_s[top].tolist()
-    middle = float(found.mean_deg("CDS")[top])
+    start, end = found.windows_s[HIGHEST].tolist()
+    middle = float(found.mean_deg("CDS")[HIGHEST])
     inset.set(xlim=(start, end), ylim=(middle - 0.012, middle + 0.012))
     inset.tick_params(labelsize=7.5)
     axes.indicate_inset_zoom(inset, edgecolor="0.4")

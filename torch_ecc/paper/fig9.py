@@ -13,7 +13,7 @@ from torch_ecc.paper import parasitic
 from torch_ecc.paper.errors import rms
 from torch_ecc.paper.parasitic import Deviations
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells
-from torch_ecc.paper.steps import VIEW_UM, Staircase, staircase
+from torch_ecc.paper.steps import HIGHEST, VIEW_UM, Staircase, staircase
 from torch_ecc.plots.style import COMPONENTS, letter, new_figure
 
 UP, DOWN, LAW = "#0072b2", "#d55e00", "#1b1b1b"
@@ -85,16 +85,13 @@ def draw(found: Staircase, by_sensors: Deviations, by_truth: Deviations) -> Figu
     plane, parts, left = figure.subplots(1, 3, width_ratios=(1, 1.35, 1.35))
     track, sensors = found.tracks["ECC"], found.sensors
     time = track.time_s + found.alignment.offset_s
-    top = int(found.levels_deg.argmax())
-    turning = float(found.windows_s[top].mean())
+    turning = float(found.windows_s[HIGHEST].mean())
     law = parasitic.predicted(sensors.pose)
     for rows, colour, words in ((time < turning, UP, "ascent"), (time >= turning, DOWN, "descent")):
         plane.plot(*track.pose[rows, :2].T, ".", ms=2, color=colour, label=words)
     plane.plot(*law[::16].T, color=LAW, lw=0.8, label=r"lever arm x $\theta$ of CDS")
-    plane.set(xlabel="x (um)", ylabel="y (um)")
-    plane.set_aspect("equal", "datalim")
+    plane.set(title=letter("(a) in the plane"), xlabel="x (um)", ylabel="y (um)", aspect="equal", adjustable="datalim")
     plane.legend(loc="upper left", markerscale=3)
-    letter(plane, "(a) in the plane")
     _draw_parts(parts, time, track.pose, (sensors.time_s, law))
     _draw_left(left, by_sensors, by_truth)
     return figure
@@ -104,9 +101,8 @@ def _draw_parts(axes: Axes, time: Tensor, pose: Tensor, law: tuple[Tensor, Tenso
     for i, colour in enumerate((UP, DOWN)):
         axes.plot(law[0], law[1][:, i], color="0.6", lw=0.6)
         axes.plot(time, pose[:, i], color=colour, lw=0.9, label=COMPONENTS[i])
-    axes.set(xlabel="time (s)", ylabel="x, y (um)")
+    axes.set(title=letter("(b) components"), xlabel="time (s)", ylabel="x, y (um)")
     axes.legend(loc="lower left")
-    letter(axes, "(b) components")
 
 
 def _draw_left(axes: Axes, by_sensors: Deviations, by_truth: Deviations) -> None:
@@ -119,6 +115,5 @@ def _draw_left(axes: Axes, by_sensors: Deviations, by_truth: Deviations) -> None
     axes.axhline(0, color="0.6", lw=0.8)
     axes.set(xlabel="step, up and down", ylabel=r"minus lever arm x $\theta$ (nm)", xticks=steps)
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
+    axes.set(title=letter("(c) deviation of the means"), ylim=(low, high + 0.2 * (high - low)))  # room for the legend
     axes.legend(fontsize=8, ncols=2, loc="upper center")
-    letter(axes, "(c) deviation of the means")

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.align import align
-from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.pose import retract
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.sampling import Sampler, make_sampler
@@ -20,10 +19,10 @@ from torch_ecc.paper.ref34 import PAPER_ITERATIONS, Ref34
 class Aligned:
     """Templates (R, 1, h + 2 MARGIN, w + 2 MARGIN) prepared once with ``options``, then aligned frame by frame.
 
-    ``found``: the record of the last frame. What is not found stays where it was.
+    ``status`` and ``iterations`` (R,) are of the last frame. What is not found stays where it was.
     """
 
-    found: Estimate
+    status: Tensor
     iterations: Tensor
 
     def __init__(self, templates: Tensor, pose: Tensor, options: Mapping[str, Any], interpolation: str) -> None:
@@ -34,8 +33,8 @@ class Aligned:
     def track(self, frame: Tensor) -> Tensor:
         """Poses (R, 3) in the next frame."""
         settings: dict[str, Any] = {"interpolation": self.interpolation, "max_iterations": PAPER_ITERATIONS}
-        self.found = align(self.reference, frame, self.pose, **settings)
-        self.pose, self.iterations = self.found.pose, self.found.iterations
+        found = align(self.reference, frame, self.pose, robust=False, **settings)  # as ref. 34: plain least squares
+        self.pose, self.iterations, self.status = found.pose, found.iterations, found.status
         return self.pose
 
     def sampler(self, image: Tensor, interpolation: str) -> Sampler:

@@ -12,8 +12,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import kornia
-import matplotlib
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -86,11 +84,8 @@ def cells(values: Iterable[float] | Tensor, form: str, sigma: Tensor | None = No
 
 def environment() -> dict[str, str]:
     """Versions, threads and machine that numbers depend on."""
-    return {
-        "torch_ecc": version("torch-ecc"),
-        "torch": torch.__version__,
-        "kornia": kornia.__version__,
-        "matplotlib": matplotlib.__version__,
+    versions = {name: version(name) for name in ("torch_ecc", "torch", "kornia", "matplotlib")}
+    return versions | {
         "python": platform.python_version(),
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
         "threads": str(torch.get_num_threads()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -14,7 +15,7 @@ from torch_ecc.paper import trials
 from torch_ecc.paper.methods import METHODS
 from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, cells, counter
 from torch_ecc.paper.scheme import SIZE
-from torch_ecc.paper.trials import FOUND, JUMP, NOISE, TURN, UNNOTICED, Change, Found, camera
+from torch_ecc.paper.trials import CAMERA, FOUND, JUMP, NOISE, TURN, UNNOTICED, Change, Found
 from torch_ecc.plots.style import letter, new_figure
 from torch_ecc.sim import Occluder
 
@@ -35,7 +36,6 @@ LOOKS = {  # of curves that are no METHODS: colour and dashes
 class Sweep(NamedTuple):
     """What is varied, from easy to hard."""
 
-    title: str
     label: str
     levels: Sequence[float]
     change: Callable[[float], Change]
@@ -54,31 +54,24 @@ def covered(share: float) -> Change:
     """Something dark in front of the camera covers that share of the template from one side, up to the jump."""
     right = float(trials.MIDDLE[0]) - SIZE / 2 + share * SIZE
     occluder = Occluder(center=(right / 2 - 50, trials.FRAME[0] / 2), half_size=(right / 2 + 50, trials.FRAME[0]))
-    return Change(camera=camera(occluders=(occluder,) if share else ()))
+    return Change(camera=replace(CAMERA, occluders=(occluder,) if share else ()))
 
 
 def dimmed(contrast: float) -> Change:
     """That share of the contrast is left; the noise stays."""
-    return Change(camera=camera(gain=contrast, offset=MEAN * (1 - contrast)))
+    return Change(camera=replace(CAMERA, gain=contrast, offset=MEAN * (1 - contrast)))
 
 
-BASIN = {
-    "jump": Sweep("jump", "jump between frames (px)", (1, 4, 8, 12, 18, 25, 35, 50), lambda v: Change(jump=v, turn=0)),
-    "turn": Sweep("turn", "turn between frames (deg)", (1, 4, 8, 12, 18, 25, 35, 50), lambda v: Change(jump=0, turn=v)),
-}
+FAR = (1, 4, 8, 12, 18, 25, 35, 50)
 SWEEPS = {
-    "blur": Sweep(
-        "blur",
-        "blur of the frame, sigma (px)",
-        (0, 1, 2, 3, 4, 5, 6),
-        lambda v: Change(camera=camera(blur_sigma=v)),
-    ),
-    "occlusion": Sweep("occlusion", "covered share of the template", (0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4), covered),
-    "contrast": Sweep("contrast", "contrast left in the frame", (1, 0.5, 0.2, 0.1, 0.05, 0.03, 0.02), dimmed),
-    "size": Sweep(
-        "template size", "side of the template (px)", (121, 81, 51, 31, 21, 15, 11), lambda v: Change(size=int(v))
-    ),
+    "jump": Sweep("jump between frames (px)", FAR, lambda v: Change(jump=v, turn=0)),
+    "turn": Sweep("turn between frames (deg)", FAR, lambda v: Change(jump=0, turn=v)),
+    "blur": Sweep("blur of the frame, sigma (px)", range(7), lambda v: Change(camera=replace(CAMERA, blur_sigma=v))),
+    "occlusion": Sweep("covered share of the template", (0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4), covered),
+    "contrast": Sweep("contrast left in the frame", (1, 0.5, 0.2, 0.1, 0.05, 0.03, 0.02), dimmed),
+    "size": Sweep("side of the template (px)", (121, 81, 51, 31, 21, 15, 11), lambda v: Change(size=int(v))),
 }
+BASIN = ("jump", "turn")  # which one picture shows together
 REMARKS = (
     f"Templates of {SIZE} px at random places and angles of the default micrograph, some of them on little texture. "
     f"Where they are not varied: a jump of {JUMP:g} px in any direction, a turn of {TURN:g} deg, noise of {NOISE:g} "
@@ -100,13 +93,12 @@ REMARKS = (
 def run(quick: bool, advance: Advance) -> Experiment:
     """Sweep and draw. ``quick``: a sixth of the templates, every other level."""
     count, step = (COUNT // 6, 2) if quick else (COUNT, 1)
-    sweeps = {name: s._replace(levels=s.levels[::step]) for name, s in (BASIN | SWEEPS).items()}
+    sweeps = {name: s._replace(levels=s.levels[::step]) for name, s in SWEEPS.items()}
     tick = counter(sum(len(s.levels) for s in sweeps.values()) + 2, advance)
     changes = {name: [s.change(v) for v in s.levels] for name, s in sweeps.items()}
     found = {name: trials.sweep(c, count, tick, trackers=name in BASIN) for name, c in changes.items()}
     errors = {noise: trials.sampler_errors(noise, count, SAMPLERS, tick) for noise in (0.0, NOISE)}
-    pictures = [_basin(sweeps, found), *(_picture(name, sweeps[name], found[name]) for name in SWEEPS)]
-    pictures.append(_samplers(errors))
+    pictures = [*_pictures(sweeps, found), _samplers(errors)]
     tables = [_table(sweeps, found, count), _sampler_table(errors)]
     records = [
         Number(f"robustness {name}: {sweeps[name].label} up to which {ENOUGH:.0%} are found, {m}", limit, "1", better)
@@ -127,26 +119,26 @@ def limits(swept: Sweep, found: Found) -> dict[str, float]:
     return result
 
 
-def _rates(swept: Sweep, found: Found, log: str = "") -> Panel:
-    curves = {name: (swept.levels, rate) for name, rate in found.rate.items()}
-    return Panel("templates found", (swept.label, "share of the templates"), curves, log)
-
-
-def _basin(sweeps: Mapping[str, Sweep], found: Mapping[str, Found]) -> Picture:
-    panels = [_rates(sweeps[name], found[name]) for name in BASIN]
+def _pictures(sweeps: Mapping[str, Sweep], found: Mapping[str, Found]) -> list[Picture]:
+    """The basin, and of every other sweep how many are found and how exactly."""
+    rates, errors = {}, {}
+    for name, swept in sweeps.items():
+        log, levels = "x" if name == "contrast" else "", swept.levels
+        curves = {m: (levels, rate) for m, rate in found[name].rate.items()}
+        rates[name] = Panel("templates found", (swept.label, "share of the templates"), curves, log)
+        curves = {m: (levels, error) for m, error in found[name].error.items()}
+        labels = (swept.label, "median error at the corner (px)")
+        errors[name] = Panel("error of those found", labels, curves, log + "y")
     caption = (
         "Basin: how far the start may be from the answer, in (a) position and (b) angle. "
         '"3 levels" is a pyramid, "search" the tracker\'s default, which searches the frame.'
     )
-    return Picture("basin", draw_panels(panels), caption)
-
-
-def _picture(name: str, swept: Sweep, found: Found) -> Picture:
-    log = "x" if name == "contrast" else ""
-    errors = {m: (swept.levels, values) for m, values in found.error.items() if values}
-    panel = Panel("error of those found", (swept.label, "median error at the corner (px)"), errors, log + "y")
-    caption = f"Over {swept.title}: (a) share of the templates found, (b) how exactly."
-    return Picture(name, draw_panels([_rates(swept, found, log), panel]), caption)
+    pictures = [Picture("basin", draw_panels([rates[name] for name in BASIN]), caption)]
+    for name in [name for name in sweeps if name not in BASIN]:
+        over = "template size" if name == "size" else name
+        caption = f"Over {over}: (a) share of the templates found, (b) how exactly."
+        pictures.append(Picture(name, draw_panels([rates[name], errors[name]]), caption))
+    return pictures
 
 
 def _samplers(errors: Mapping[float, Mapping[str, Tensor]]) -> Picture:
@@ -168,9 +160,9 @@ def draw_panels(panels: Sequence[Panel]) -> Figure:
             colour, dashes = (METHODS[name].colour, METHODS[name].dashes) if name in METHODS else LOOKS[name]
             marker = "." if len(x) < 20 else ""
             (handles[name],) = axes.plot(x, y, dashes, marker=marker, color=colour)
-        axes.set(xlabel=panel.labels[0], ylabel=panel.labels[1], xscale="log" if "x" in panel.log else "linear")
+        axes.set(title=letter(f"({'ab'[k]}) {panel.title}"), xlabel=panel.labels[0], ylabel=panel.labels[1])
+        axes.set(xscale="log" if "x" in panel.log else "linear")
         axes.set(**({"yscale": "log"} if "y" in panel.log else {"ylim": (-0.03, 1.03)}))
-        letter(axes, f"({'ab'[k]}) {panel.title}")
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
     return figure
 

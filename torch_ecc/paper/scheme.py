@@ -9,27 +9,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ecc import sim
 from torch_ecc.core.pose import compose, inverse
 from torch_ecc.core.reference import MARGIN
-from torch_ecc.sim import (
-    Camera,
-    FieldLight,
-    GradientLight,
-    Lights,
-    Retinex,
-    Scene,
-    VignetteLight,
-    harmonic,
-    micrograph,
-    placed,
-    single_scale,
-)
 
 SIZE = 121  # px, side of the paper's template
 FRAME = (480, 640)  # (h, w) px
 CENTRE = (320.0, 240.0)  # px, where the motion has its middle
 GAIN = 0.75  # exposure of the sequences of Fig. 3: the brightest spot of the uneven light stays below white
-LAMP = Lights((VignetteLight(0.4), GradientLight(0.5, 0.3)))  # a lamp off the axis, behind a lens
+LAMP = sim.Lights((sim.VignetteLight(0.4), sim.GradientLight(0.5, 0.3)))  # a lamp off the axis, behind a lens
 SURROUND = 150.0  # px, Gaussian of the Retinex surround: wider than any block of the micrograph
 
 
@@ -44,7 +32,7 @@ class Harmonic:
     def path(self, size: tuple[int, int] = FRAME) -> Tensor:
         """Poses (points, 3) px, px, rad of the scene about the middle of a frame (h, w)."""
         turn = math.radians(self.degrees)
-        return placed(harmonic((self.amplitude, self.amplitude, turn), self.points), (size[1] / 2, size[0] / 2))
+        return sim.placed(sim.harmonic((self.amplitude, self.amplitude, turn), self.points), (size[1] / 2, size[0] / 2))
 
     def closed(self, size: tuple[int, int] = FRAME) -> Tensor:
         """The same (points + 1, 3), begun with the pose that they end with."""
@@ -92,41 +80,31 @@ def cut_reflected() -> Cut:
     return Cut(middle, middle)
 
 
-def scene() -> Scene:
+def scene() -> sim.Scene:
     """What the reflected component shows, known exactly everywhere: the default micrograph."""
-    return micrograph()
+    return sim.micrograph()
 
 
 def original() -> Tensor:
     """Fig. 2(a): the micrograph under uneven light, (1, 1, 480, 640) uint8."""
-    return Camera(size=FRAME, light=LAMP).capture(scene(), cut_reflected().pose[None])
+    return sim.Camera(size=FRAME, light=LAMP).capture(scene(), cut_reflected().pose[None])
 
 
-def components() -> Retinex:
+def components() -> sim.Retinex:
     """Fig. 2(b), (c): reflected and incident component of the original, (1, 1, 480, 640) each."""
-    return single_scale(original().float(), SURROUND)
+    return sim.single_scale(original().float(), SURROUND)
 
 
-def uneven_light() -> FieldLight:
+def uneven_light() -> sim.FieldLight:
     """The incident component of the original as the light of a sequence: it stays with the camera."""
-    return FieldLight(components().incident[0, 0])
+    return sim.FieldLight(components().incident[0, 0])
 
 
-@dataclass(frozen=True, eq=False)
-class Kept:
+class Kept(NamedTuple):
     """A scene rendered once: ``frames`` (1 or B, 1, H, W) stand for its rendering at the same pose or poses, for
     any number of cameras and draws of the noise."""
 
-    scene: Scene
     frames: Tensor
-
-    def value(self, points: Tensor) -> Tensor:
-        """(..., 2) -> (...)."""
-        return self.scene.value(points)
-
-    def gradient(self, points: Tensor) -> Tensor:
-        """(..., 2) -> (..., 2)."""
-        return self.scene.gradient(points)
 
     def render(self, poses: Tensor, size: tuple[int, int]) -> Tensor:
         """The middle (B, 1, h, w) of the frames kept, for B poses."""

@@ -53,18 +53,9 @@ def trial(values: Mapping[str, Any]) -> Trial:
     job = ServoJob.read(values)
     alignee = prepare_parts(job)
     run: Run = run_alignment(job, alignee)
-    results = [r for r in run.alignment[1:3] if r is not None]
-    period, stages = job.cell.microscope.period, list(alignee.station.stages.values())
-    used = [shares(r.log, stage, period) for r, stage in zip(results, stages, strict=False)]
-    return Trial(
-        run.alignment.ending,
-        float(run.error[:2].norm()),
-        math.degrees(abs(float(run.error[2]))),
-        float(run.miss.norm()),
-        sum(len(r.log.time) for r in results),
-        max(u[0] for u in used),
-        max(u[1] for u in used),
-    )
+    logs, stages = [result.log for result in run.alignment.results], alignee.station.stages.values()
+    used = [shares(log, stage, job.cell.microscope.period) for log, stage in zip(logs, stages, strict=False)]
+    return Trial(run.alignment.ending, *run.off, sum(len(log.time) for log in logs), *map(max, zip(*used, strict=True)))
 
 
 def error_cells(error: Tensor) -> list[str]:

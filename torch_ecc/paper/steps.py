@@ -12,16 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.paper.acquisition import (
-    COMMAND_HZ,
-    Acquisition,
-    Bench,
-    acquire,
-    frames_of,
-    microscope,
-    simulated_once,
-    zeroed,
-)
+from torch_ecc.paper.acquisition import COMMAND_HZ, Acquisition, Bench, microscope, simulated_once, zeroed
 from torch_ecc.paper.result import Advance, Table, cells, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Dwells, Motion, dwell_errors
@@ -29,7 +20,8 @@ from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
 from torch_ecc.sim import GradientLight, LampDrift, Lights
 
 STEP_DEG, HIGHEST = 0.04, 6
-LEVELS = (*range(HIGHEST + 1), *range(HIGHEST - 1, -1, -1))  # in steps
+LEVELS = torch.tensor((*range(HIGHEST + 1), *range(HIGHEST - 1, -1, -1)), dtype=torch.float64)  # in steps
+LEVELS_DEG = STEP_DEG * LEVELS  # what is commanded
 ZOOM = 0.7  # "the focal length of the zoom lens is set to the minimum"
 VIEW_UM = (1500.0, -1000.0)  # the template, from the origin of the stage's moving part
 LAMP = 0.2  # of its light that the lamp gains in the first half of the staircase, and loses in the second
@@ -38,9 +30,9 @@ SETTLE_S = 0.15  # after which a dwell is counted
 METHODS = {"ECC": {}, "ECC, gain": {"illumination": "gain"}, "SSD": {"criterion": "ssd"}}
 
 
-def step_table(title: str, levels_deg: Tensor, columns: Mapping[str, Tensor], first: int = 0) -> Table:
+def step_table(title: str, columns: Mapping[str, Tensor], first: int = 0) -> Table:
     """Angles (K,) in deg by name beside those commanded at steps ``first``, ``first`` + 1, ..."""
-    values = zip(levels_deg.tolist(), *(column.tolist() for column in columns.values()), strict=True)
+    values = zip(LEVELS_DEG[first:].tolist(), *(column.tolist() for column in columns.values()), strict=True)
     rows = [(f"{k}", f"{level:.2f}", *cells(row, ".5f")) for k, (level, *row) in enumerate(values, first)]
     return Table(title, ("step", "commanded", *columns), rows)
 
@@ -49,8 +41,7 @@ class Staircase(NamedTuple):
     """Records zeroed at rest, and their dwells: ``tracks`` and ``dwells`` by method, "CDS" among the dwells.
 
     ``alignment`` is that of ECC with the sensors, with the lever arm from the sensors' point to the template;
-    ``levels_deg`` (K,) what was commanded; ``windows_s`` (K, 2) where each dwell counts on the sensors' clock;
-    ``calibration`` from the image to the stage.
+    ``windows_s`` (K, 2) where each dwell counts on the sensors' clock; ``calibration`` from the image to the stage.
     """
 
     acquired: Acquisition
@@ -58,7 +49,6 @@ class Staircase(NamedTuple):
     sensors: Motion
     dwells: dict[str, Dwells]
     alignment: Alignment
-    levels_deg: Tensor
     windows_s: Tensor
     calibration: Calibration
 
@@ -70,7 +60,7 @@ class Staircase(NamedTuple):
 
 def command(dwell_s: float) -> Tensor:
     """Thirteen dwells of theta at (0, 0): (T, 3) um, um, rad at 1 kHz."""
-    theta = math.radians(STEP_DEG) * torch.tensor(LEVELS, dtype=torch.float64)
+    theta = math.radians(STEP_DEG) * LEVELS
     turn = theta.repeat_interleave(round(dwell_s * COMMAND_HZ))
     return torch.stack((0 * turn, 0 * turn, turn), -1)
 
@@ -80,10 +70,9 @@ def staircase(quick: bool, advance: Advance) -> Staircase:
     """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
     dwell_s = 0.3 if quick else 3.0
     view, path = microscope(quick, zoom=ZOOM, view_um=VIEW_UM), command(dwell_s)
-    frames = frames_of(path, Bench(microscope=view))
+    frames = Bench(view).frames(path)
     light = Lights((GradientLight(), LampDrift(LAMP, period=2.2 * frames)))
-    bench = Bench(microscope=view, methods=METHODS, gain=GAIN, light=light)
-    acquired = acquire(path, bench, counter(frames, advance))
+    acquired = Bench(view, light, GAIN, METHODS).acquire(path, counter(frames, advance))
     angle, rest = view.axis_angle, dwell_s / 4  # the angle is known from the circles
     turn, calibration = Calibration(1.0, angle), Calibration(view.um_per_px, angle)
     sensors = zeroed(acquired.sensors, rest)
@@ -94,5 +83,4 @@ def staircase(quick: bool, advance: Advance) -> Staircase:
     windows = torch.stack((starts + SETTLE_S, starts + dwell_s - 0.01), 1)
     dwells = {name: dwell_errors(m, windows - alignment.offset_s) for name, m in tracks.items()}
     dwells["CDS"] = dwell_errors(sensors, windows)
-    levels = STEP_DEG * torch.tensor(LEVELS, dtype=torch.float64)
-    return Staircase(acquired, tracks, sensors, dwells, alignment, levels, windows, calibration)
+    return Staircase(acquired, tracks, sensors, dwells, alignment, windows, calibration)

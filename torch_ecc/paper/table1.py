@@ -58,17 +58,17 @@ def run(quick: bool, advance: Advance) -> Experiment:
         "Time per frame over the number of iterations K, less that of ref. 34, which pays its precomputation at every "
         "frame: below zero ref. 34 is slower. (a) here, B-spline iterations; (b) from the paper's Table I."
     )
+    table, records = _numbers(times)
     picture = Picture("table1", draw(times), caption)
-    return Experiment("table1", "Table I: time", [picture], [_table(times)], _records(times), _remarks(times))
+    return Experiment("table1", "Table I: time", [picture], [table], records, _remarks(times))
 
 
 def measure(rounds: int, frames: int, advance: Advance) -> dict[str, Times]:
     """Every method once per round, in turn, after one round that does not count."""
-    path, cut = scheme.TEXT.path(), scheme.cut_first(scheme.TEXT.path())
-    starts = torch.linspace(0, len(path) // 2, frames + 1).long()[:-1]
-    images = Camera(size=scheme.FRAME, gain=scheme.GAIN).capture(
-        scheme.scene(), path[torch.cat((starts[:1], starts + 1))]
-    )
+    path = scheme.TEXT.path()
+    cut, starts = scheme.cut_first(path), torch.linspace(0, len(path) // 2, frames + 1).long()[:-1]
+    seen = path[torch.cat((starts[:1], starts + 1))]
+    images = Camera(size=scheme.FRAME, gain=scheme.GAIN).capture(scheme.scene(), seen)
     template, truth = cut.template(images[:1]), cut.truth(path)
     fast = frames // 2  # where the motion is fastest
     followers = {name: method.start(template, truth[starts[[fast]]]) for name, method in METHODS.items()}
@@ -149,8 +149,8 @@ def draw(times: dict[str, Times]) -> Figure:
     left.legend(loc="upper left")
     for axes, title in ((left, "(a) here, one thread"), (right, "(b) the paper, MATLAB")):
         axes.axhline(0, color="#333333", lw=1, ls=":")
-        axes.set(xlabel="iterations K", ylabel="time per frame less ref. 34's (ms)", xlim=(0, LONGEST))
-        letter(axes, title)
+        axes.set(title=letter(title), xlabel="iterations K", ylabel="time per frame less ref. 34's (ms)")
+        axes.set_xlim(0, LONGEST)
     return figure
 
 
@@ -159,13 +159,23 @@ def _spread(values: Sequence[float]) -> str:
     return f"{middle:.3f} ({low:.3f} to {high:.3f})"
 
 
-def _table(times: dict[str, Times]) -> Table:
-    rows = []
+def _numbers(times: dict[str, Times]) -> tuple[Table, list[Number]]:
+    """The times of every method as a table, and beside the paper's."""
+    rows, records = [], []
     for name, t in times.items():
-        formula = "t_pre + K t_it" if name == "ref34" else "K t_it"
+        again, paper, label = name == "ref34", PAPER.get(name, {}), f"table1 {name}"
         occur = f"{t.mean_iterations:.1f} ({max(t.iterations)})"
-        cross = "" if name == "ref34" else _cross(times, name)
-        rows.append((METHODS[name].label, *map(_spread, t.ms.values()), formula, occur, cross))
+        ways = ("t_pre + K t_it", occur, "") if again else ("K t_it", occur, _cross(times, name))
+        rows.append((METHODS[name].label, *map(_spread, t.ms.values()), *ways))
+        records += [Number(f"{label}, {work}", t.median(work), "ms", paper=paper.get(work)) for work in WORKS]
+        records += [
+            Number(f"{label}, mean K", t.mean_iterations, "iterations"),
+            Number(f"{label}, per frame by the paper's formula at its mean K", per_frame(times, name), "ms"),
+        ]
+        if not again:
+            most, paper_K = float(max(t.iterations)), float(PAPER_CROSSOVER) if name == "gain" else None
+            label += ", K beyond which ref34 is faster (limit: the largest K that occurs)"
+            records.append(Number(label, crossover(t, times["ref34"]), "iterations", "higher", most, paper_K))
     rows.append(("paper, proposed (MATLAB)", "9.9", "", "3.6", "", "K t_it", "at most 15", str(PAPER_CROSSOVER)))
     rows.append(("paper, ref. 34 (MATLAB)", "7.5", "", "3.3", "", "t_pre + K t_it", "at most 15", ""))
     header = ("method", "t_pre", "t_it, bilinear", "t_it, B-spline", "whole frame", "per frame", "K mean (most)", "K*")
@@ -175,29 +185,12 @@ def _table(times: dict[str, Times]) -> Table:
         "preparation of the sampler, both stages and, but for ref. 34, score, status and covariance. K: iterations "
         "that occur along the text's motion. K*: beyond it ref. 34 would be faster."
     )
-    return Table("Table I: time of precomputation and iteration", header, rows, note)
+    return Table("Table I: time of precomputation and iteration", header, rows, note), records
 
 
 def _cross(times: dict[str, Times], name: str) -> str:
     K = crossover(times[name], times["ref34"])
     return "never" if math.isinf(K) else f"{K:.0f}"
-
-
-def _records(times: dict[str, Times]) -> list[Number]:
-    records = []
-    for name, t in times.items():
-        paper = PAPER.get(name, {})
-        records += [Number(f"table1 {name}, {work}", t.median(work), "ms", paper=paper.get(work)) for work in WORKS]
-        records += [
-            Number(f"table1 {name}, mean K", t.mean_iterations, "iterations"),
-            Number(f"table1 {name}, per frame by the paper's formula at its mean K", per_frame(times, name), "ms"),
-        ]
-        if name != "ref34":
-            most = float(max(t.iterations))
-            paper_K = float(PAPER_CROSSOVER) if name == "gain" else None
-            label = f"table1 {name}, K beyond which ref34 is faster (limit: the largest K that occurs)"
-            records.append(Number(label, crossover(t, times["ref34"]), "iterations", "higher", most, paper_K))
-    return records
 
 
 def _remarks(times: dict[str, Times]) -> list[str]:

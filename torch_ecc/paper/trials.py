@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -14,7 +14,8 @@ from torch import Tensor
 from torch_ecc.core.estimate import Status
 from torch_ecc.core.pose import compose
 from torch_ecc.paper.errors import errors
-from torch_ecc.paper.methods import COMPARED, METHODS, Aligned, Follower
+from torch_ecc.paper.methods import COMPARED, METHODS, Follower
+from torch_ecc.paper.ref34 import Ref34
 from torch_ecc.paper.scheme import SIZE, Cut, Kept, scene
 from torch_ecc.sim import Camera
 from torch_ecc.track.recover import AT_ONCE
@@ -34,10 +35,7 @@ UNNOTICED = "wrong, not noticed"
 SEED = 5
 
 
-def camera(**options: Any) -> Camera:
-    """The camera of all trials, 8 bit, with whatever is varied."""
-    settings: dict[str, Any] = {"size": FRAME, "noise_sigma": NOISE}
-    return Camera(**(settings | options))
+CAMERA = Camera(size=FRAME, noise_sigma=NOISE)  # of all trials, 8 bit, with whatever is varied
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +45,7 @@ class Change:
     jump: float = JUMP  # px, in any direction
     turn: float = TURN  # deg, either way
     size: int = SIZE
-    camera: Camera = field(default_factory=camera)  # of the second frame
+    camera: Camera = CAMERA  # of the second frame
 
 
 class Found(NamedTuple):
@@ -75,63 +73,58 @@ def pairs(count: int, jump: float, turn: float) -> tuple[Cut, Tensor]:
 def _rendered(count: int, jump: float, turn: float) -> Kept:
     """The second frames without what the camera does to them, and with a border."""
     second = pairs(count, jump, turn)[1] + torch.tensor((BORDER, BORDER, 0.0), dtype=torch.float64)
-    return Kept(scene(), scene().render(second, (FRAME[0] + 2 * BORDER, FRAME[1] + 2 * BORDER)))
+    return Kept(scene().render(second, (FRAME[0] + 2 * BORDER, FRAME[1] + 2 * BORDER)))
+
+
+class Tracked:
+    """Trackers with ``options`` of templates in the middle of first frames (B, 1, H, W), made anew for every frame.
+
+    ``status`` (B,): that of the last one.
+    """
+
+    status: Tensor
+
+    def __init__(self, first: Tensor, size: int, options: Mapping[str, Any]) -> None:
+        self.first, self.size, self.options, self.pose = first, size, options, MIDDLE.expand(len(first), 3)
+
+    def track(self, frames: Tensor) -> Tensor:
+        """Poses (B, 3) in the next frames."""
+        # So few at once that all that need it are searched for in this very frame.
+        some = zip(*(f.split(AT_ONCE) for f in (self.first, frames, self.pose[:, :2])), strict=True)
+        found = [Tracker(a, at, self.size, prediction="hold", **self.options)(b) for a, b, at in some]
+        self.status = torch.cat([estimate.status for estimate in found])
+        return torch.cat([estimate.pose for estimate in found])
 
 
 def sweep(changes: Sequence[Change], count: int, tick: Callable[[], None], *, trackers: bool = False) -> Found:
     """All methods, with ``trackers`` also those, over changes that make one thing worse and worse."""
-    names = [*COMPARED, *(TRACKERS if trackers else ())]
+    names, watched = (COMPARED, "linear") if not trackers else ((*COMPARED, *TRACKERS), "linear, search")
     found = Found({name: [] for name in (*names, UNNOTICED)}, {name: [] for name in names})
-    first = camera().capture(scene(), pairs(count, 0, 0)[0].pose, seed=SEED)
-    prepared: dict[int, dict[str, Follower]] = {}
+    first = CAMERA.capture(scene(), pairs(count, 0, 0)[0].pose, seed=SEED)
+    followers: dict[int, dict[str, Follower | Tracked]] = {}
     for change in changes:
         cut, second = pairs(count, change.jump, change.turn)
         frames = change.camera.capture(_rendered(count, change.jump, change.turn), second, seed=SEED + 1)
-        if change.size not in prepared:
-            prepared[change.size] = _prepare(first, change.size)
-        poses, believed = _track(prepared[change.size], frames)
-        if trackers:
-            more, believed = _track_once(first, frames, change.size)
-            poses |= more
-        errors = {name: corner_error(pose, cut.truth(second), change.size) for name, pose in poses.items()}
-        for name, error in errors.items():
+        if change.size not in followers:
+            followers[change.size] = {name: _start(name, first, change.size) for name in names}
+        for name, follower in followers[change.size].items():
+            follower.pose = MIDDLE.expand(count, 3)
+            error = corner_error(follower.track(frames), cut.truth(second), change.size)
             good = error < FOUND
             found.rate[name].append(float(good.double().mean()))
             found.error[name].append(float(error[good].quantile(0.5)) if bool(good.any()) else math.nan)
-        watched = errors["linear, search" if trackers else "linear"]
-        found.rate[UNNOTICED].append(float((believed & (watched >= FOUND)).double().mean()))
+            if name == watched and not isinstance(follower, Ref34):
+                unnoticed = Status.good(follower.status) & ~good
+                found.rate[UNNOTICED].append(float(unnoticed.double().mean()))
         tick()
     return found
 
 
-def _prepare(first: Tensor, size: int) -> dict[str, Follower]:
-    template = Cut(MIDDLE, MIDDLE).template(first, size)
-    return {name: METHODS[name].start(template, MIDDLE.expand(len(first), 3)) for name in COMPARED}
-
-
-def _track(followers: Mapping[str, Follower], frames: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-    """Poses (B, 3) by method, started at the first frame's; and where the default one calls its pose good, (B,)."""
-    poses, believed = {}, torch.ones(len(frames), dtype=torch.bool)
-    for name, follower in followers.items():
-        follower.pose = MIDDLE.expand(len(frames), 3)
-        poses[name] = follower.track(frames)
-        if name == "linear" and isinstance(follower, Aligned):
-            believed = Status.good(follower.found.status)
-    return poses, believed
-
-
-def _track_once(first: Tensor, frames: Tensor, size: int) -> tuple[dict[str, Tensor], Tensor]:
-    """Poses (B, 3) by tracker; and where the one that searches, the default, calls its pose good, (B,)."""
-    poses, good = {}, torch.ones(len(first), dtype=torch.bool)
-    for name, options in TRACKERS.items():
-        # So few at once that all that need it are searched for in this very frame.
-        found = [
-            Tracker(before, MIDDLE[:2].expand(len(before), 2), size, prediction="hold", **options)(after)
-            for before, after in zip(first.split(AT_ONCE), frames.split(AT_ONCE), strict=True)
-        ]
-        poses[name] = torch.cat([estimate.pose for estimate in found])
-        good = Status.good(torch.cat([estimate.status for estimate in found]))
-    return poses, good
+def _start(name: str, first: Tensor, size: int) -> Follower | Tracked:
+    """The method or tracker of that name, with templates of ``size`` px in first frames (B, 1, H, W)."""
+    if name in TRACKERS:
+        return Tracked(first, size, TRACKERS[name])
+    return METHODS[name].start(Cut(MIDDLE, MIDDLE).template(first, size), MIDDLE.expand(len(first), 3))
 
 
 def corner_error(pose: Tensor, truth: Tensor, size: int) -> Tensor:
@@ -144,7 +137,7 @@ def corner_error(pose: Tensor, truth: Tensor, size: int) -> Tensor:
 def sampler_errors(noise: float, count: int, samplers: Sequence[str], tick: Callable[[], None]) -> dict[str, Tensor]:
     """Sorted errors px of x and y of the templates that the default method finds, by sampler; both frames have
     ``noise`` grey levels."""
-    (cut, second), view = pairs(count, JUMP, TURN), camera(noise_sigma=noise)
+    (cut, second), view = pairs(count, JUMP, TURN), replace(CAMERA, noise_sigma=noise)
     first, frames = view.capture(scene(), cut.pose, seed=SEED), view.capture(scene(), second, seed=SEED + 1)
     template, start = cut.template(first), MIDDLE.expand_as(second)
     result = {}

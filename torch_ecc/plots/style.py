@@ -7,12 +7,12 @@ from contextlib import contextmanager
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 RC: Any = {
     "font.size": 9,
     "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -39,7 +39,7 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def letter(axes: Axes, text: str) -> None:
-    """A bold panel letter with words behind it, top left, as in the paper's figures: "(a) ..."."""
+def letter(text: str) -> str:
+    """The title of a panel with its letter in bold, as in the paper's figures: "(a) ..."."""
     label, _, words = text.partition(" ")
-    axes.set_title(rf"$\bf{{{label}}}$ {words}", loc="left")
+    return rf"$\bf{{{label}}}$ {words}"

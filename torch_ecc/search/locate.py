@@ -8,7 +8,8 @@ a whitened matched filter finds at full resolution (``matched_filter``) come in 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -25,6 +26,7 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import Sampler, downsample, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, iterate
+from torch_ecc.core.verdict import within_margin
 from torch_ecc.search.bank import Bank, search_level
 from torch_ecc.search.matched_filter import whitened_matches
 
@@ -44,7 +46,6 @@ MAX_RESTARTS = 3
 COARSE_ITERATIONS = 6
 COARSE_TOLERANCE = 0.1  # px of a coarse level
 LEAST_VISIBLE = 0.4  # of a template's weight must lie in the frame
-AMBIGUITY_MARGIN = (1.5, 0.01)  # (a, b): a score s is as good as the best if 1 - s <= a (1 - s_best) + b
 
 
 class Located(NamedTuple):
@@ -79,7 +80,7 @@ class Located(NamedTuple):
 def locate(
     reference: Reference,
     image: Tensor,
-    **options: str | float,
+    **options: str | float | bool,
 ) -> Located:
     """Poses of B prepared templates anywhere in their images, (B or 1, 1, H, W), at any angle -> Located.
 
@@ -102,7 +103,8 @@ class Locator:
     @lasting
     def __init__(self, reference: Reference, size: tuple[int, int], settings: Settings | None = None) -> None:
         self.size = size
-        self.settings = settings or Settings(min_visible=LEAST_VISIBLE)
+        # A wrong place must not be made right by leaving out what does not fit.
+        self.settings = replace(settings or Settings(min_visible=LEAST_VISIBLE), robust=False)
         self.pyramids, self.banks = [], []
         for b in range(len(reference.place.radius)):
             references = pyramid(reference.select(torch.tensor([b], device=reference.place.radius.device)), MAX_LEVELS)
@@ -276,12 +278,6 @@ def ranked(found: tuple[Estimate, Tensor], *, radius: Tensor, near: Tensor | Non
         distance = torch.where(within_margin(score[order], score[order[0]]), distance, torch.inf)
         order = order[distance.argsort(stable=True)]
     return estimate.at(order), score[order]
-
-
-def within_margin(score: Any, best: Any) -> Any:
-    """Whether a ``score`` s is as good as the ``best`` one, 1 - s <= a (1 - s_best) + b, any shape: bool."""
-    a, b = AMBIGUITY_MARGIN
-    return 1 - score <= a * (1 - best) + b
 
 
 def _copies(reference: Reference, count: int) -> Reference:

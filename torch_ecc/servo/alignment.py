@@ -48,9 +48,14 @@ class Alignment(NamedTuple):
     miss: Tensor
 
     @property
+    def results(self) -> list[Result]:
+        """Of the servo steps that were begun: the substrate's, the probe's."""
+        return [result for result in (self.substrate, self.probe) if result is not None]
+
+    @property
     def ending(self) -> Ending:
-        """How the last step that was begun ended."""
-        return self.substrate.ending if self.probe is None else self.probe.ending
+        """How the last of them ended."""
+        return self.results[-1].ending
 
     @property
     def aligned(self) -> bool:
@@ -75,30 +80,41 @@ def align_parts(
     frame = substrate.plant.frame()
     for part in (substrate, probe):
         (detect or find)(part.tracker, frame)
-    detected = torch.cat((substrate.tracker.pose, probe.tracker.pose)).cpu()
-    poses = [detected[:1], detected[1:]]
+    both = _Both(substrate, probe, observe)
+    detected = torch.cat(both.poses)
+    first = servo(
+        substrate.plant, substrate.tracker, desired, substrate.jacobian, control=control, observe=both.watch(0)
+    )
+    if not first.aligned:
+        return Alignment(detected, first, None, both.miss)
+    pose = both.poses[1][0]
+    goal = torch.cat((pose[:2] - both.miss, pose[2:]))
+    second = servo(probe.plant, probe.tracker, goal, probe.jacobian, control=control, observe=both.watch(1))
+    return Alignment(detected, first, second, both.miss)
 
-    def both(moving: int) -> Observer:
-        still = (substrate, probe)[1 - moving].tracker
+
+class _Both:
+    """Both parts, tracked all the time whichever moves; ``poses``, (1, 3) of each, are those in the last frame."""
+
+    def __init__(self, substrate: Part, probe: Part, observe: Observer | None) -> None:
+        self.parts, self.observe = (substrate, probe), observe
+        self.poses = [part.tracker.pose.cpu() for part in self.parts]
+
+    def watch(self, moving: int) -> Observer:
+        """What observes the servo run of part ``moving``: tracks the other one, and tells of both."""
+        still = self.parts[1 - moving].tracker
 
         def watch(frame: Tensor, estimate: Estimate, step: Step) -> None:
             pair = [estimate, still(frame)] if moving == 0 else [still(frame), estimate]
-            poses[:] = [one.pose.cpu() for one in pair]
-            if observe is not None:
-                observe(frame, Estimate(*(torch.cat(v) for v in zip(*pair, strict=True))), step)
+            self.poses = [one.pose.cpu() for one in pair]
+            if self.observe is not None:
+                self.observe(frame, Estimate(*(torch.cat(v) for v in zip(*pair, strict=True))), step)
 
         return watch
 
-    def landing() -> Tensor:
-        return transform(poses[0], torch.tensor([[substrate.point]], dtype=torch.float64))[0, 0]
-
-    def tip() -> Tensor:
-        return transform(poses[1], torch.tensor([[probe.point]], dtype=torch.float64))[0, 0]
-
-    first = servo(substrate.plant, substrate.tracker, desired, substrate.jacobian, control=control, observe=both(0))
-    if not first.aligned:
-        return Alignment(detected, first, None, tip() - landing())
-    theta = poses[1][0, 2:]
-    goal = torch.cat((landing() - tip() + poses[1][0, :2], theta))
-    second = servo(probe.plant, probe.tracker, goal, probe.jacobian, control=control, observe=both(1))
-    return Alignment(detected, first, second, tip() - landing())
+    @property
+    def miss(self) -> Tensor:
+        """(2,) px from the landing point to the tip."""
+        both = zip(self.parts, self.poses, strict=True)
+        landing, tip = (transform(pose[0], pose.new_tensor([part.point]))[0] for part, pose in both)
+        return tip - landing

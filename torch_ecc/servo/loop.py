@@ -46,10 +46,7 @@ def servo(
     Raises ValueError before anything moves if the desired pose is outside the view or beyond what the axes and their
     travel reach, or if L is singular.
     """
-    control, goal = control or Control(), _as_pose(desired)
-    speed, acceleration, travel = read_limits(plant)
-    _check_view(tracker, goal)
-    run = _Run(tracker, goal, Controller(jacobian, control, (speed, acceleration), plant.period), travel)
+    run = _Run.checked(plant, tracker, desired, jacobian, control or Control())
     steps: list[Step] = []
     ending: Ending | None = None
     try:
@@ -65,8 +62,8 @@ def servo(
     except KeyboardInterrupt:
         ending = Ending.INTERRUPTED
     finally:
-        plant.command(torch.zeros_like(speed))
-    return Result(ending, Log.of(steps, len(speed)))
+        plant.command(torch.zeros_like(run.controller.velocity))
+    return Result(ending, Log.of(steps, len(run.controller.velocity)))
 
 
 class _Run:
@@ -76,6 +73,16 @@ class _Run:
         self.tracker, self.goal, self.controller, self.travel = tracker, goal, controller, travel
         self.watch = Watch(controller.control, float(tracker.references[0].place.radius[0]))
         self.pose, self.frames, self._fresh, self._started = goal, 0, False, False
+
+    @classmethod
+    def checked(
+        cls, plant: Plant, tracker: Tracker, desired: Tensor | Sequence[float], jacobian: Jacobian, control: Control
+    ) -> _Run:
+        """ValueError for what is known to be wrong before the first frame."""
+        goal = _as_pose(desired)
+        speed, acceleration, travel = read_limits(plant)
+        _check_view(tracker, goal)
+        return cls(tracker, goal, Controller(jacobian, control, (speed, acceleration), plant.period), travel)
 
     def step(self, frame: Tensor, estimate: Estimate) -> tuple[Step, Ending | None]:
         """What follows from a frame, and whether this is the end."""

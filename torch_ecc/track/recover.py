@@ -19,14 +19,8 @@ from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.verdict import NOISE_SHARE, noise_share
-from torch_ecc.search.locate import (
-    LEAST_VISIBLE,
-    Locator,
-    image_pyramid,
-    pose_distance,
-    within_margin,
-)
+from torch_ecc.core.verdict import NOISE_SHARE, expected_score, noise_share, unknown, within_margin
+from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import Nearby
 
@@ -66,6 +60,22 @@ def plausible(estimate: Estimate, start: Tensor, past: Past, radius: Tensor) -> 
     return Status.good(estimate.status) & familiar & (step <= BASIN + last)
 
 
+def disbelieved(estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, radius: Tensor) -> Estimate:
+    """The ``estimate`` in which those that are still suspect, and not where they are plausible, are lost."""
+    doubted = torch.tensor(suspects, device=start.device) & ~plausible(estimate, start, past, radius)
+    lost = doubted & Status.good(estimate.status)
+    return estimate._replace(
+        status=torch.where(lost, int(Status.LOST), estimate.status).to(torch.int8),
+        covariance=torch.where(lost[:, None, None], unknown(estimate.covariance), estimate.covariance),
+    )
+
+
+def familiar(found: Estimate, usual: Tensor) -> Tensor:
+    """Places (n,) that were found and look as the templates ``usual`` (n,) do."""
+    known: Tensor = within_margin(found.score, usual)
+    return known & (found.status == Status.CONVERGED)
+
+
 def beats(found: Estimate, hand: Estimate) -> Tensor:
     """Whether ``found`` places (n, ...) are clearly better than those at ``hand``: bool (n,)."""
     worse: Tensor = ~within_margin(hand.score, found.score)
@@ -80,18 +90,13 @@ def textureless(reference: Reference, settings: Settings) -> tuple[list[bool], l
     return (~(share <= NOISE_SHARE)).tolist(), hopeless.tolist()
 
 
-def expected_score(reference: Reference) -> Tensor:
-    """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
-    noise, normal = reference.noise.level, reference.normal
-    return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
-
-
 class Recovery:
     """The searches of one tracker, and what is prepared for them."""
 
     @lasting
     def __init__(self, reference: Reference, settings: Settings, turn: Tensor) -> None:
-        self.reference, self.settings = reference, settings
+        # A wrong place must not be made right by leaving out what does not fit.
+        self.reference, self.settings, self.partly = reference, replace(settings, robust=False), settings
         self.turn = turn  # whose turn it is if they are many, (): the tracker's, written in place
         self.expected = expected_score(reference)
         self.textureless, self.hopeless = textureless(reference, settings)
@@ -135,10 +140,21 @@ class Recovery:
     def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor, due: list[int]) -> Estimate:
         """Second attempt for the templates ``due``: around their ``start`` (R, 3)."""
         index = torch.tensor(due, device=start.device)
+        view, surroundings = image if len(image) == 1 else image[index], self.surroundings(due)
+        found = surroundings.find(self.reference.select(index), view, start[index], self.settings)
+        known = familiar(found, usual[index]) & beats(found, estimate.at(index))
+        estimate = estimate.put(index[known], found.at(known))
+        if not self.partly.robust or bool(known.all()):
+            return estimate
+        place, _ = surroundings.candidates(view, start[index], 1)  # something may cover a part of them
+        return self.put_partly(image, estimate, place[~known, 0], usual, index[~known])
+
+    def put_partly(self, image: Tensor, estimate: Estimate, place: Tensor, usual: Tensor, index: Tensor) -> Estimate:
+        """The ``estimate`` with those at ``index`` (n,) that are there if only a part is looked at, at ``place``."""
         view = image if len(image) == 1 else image[index]
-        found = self.surroundings(due).find(self.reference.select(index), view, start[index], self.settings)
-        known = (found.status == Status.CONVERGED) & within_margin(found.score, usual[index])
-        known &= beats(found, estimate.at(index))
+        found = solve(self.reference.select(index), view, place, self.partly, None, usual[index])
+        known = familiar(found, usual[index]) & beats(found, estimate.at(index))
+        found = found._replace(origin=torch.full_like(found.origin, int(Origin.NEARBY)))
         return estimate.put(index[known], found.at(known))
 
     def search_anywhere(self, images: list[Tensor], estimate: Estimate, past: Past, r: int) -> Estimate:
@@ -150,8 +166,8 @@ class Recovery:
         if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * past.usual[r]:
             return estimate
         index = torch.tensor([r], device=pose.device)
-        best = found.at(index.new_zeros(1))
-        if not beats(best, estimate.at(index)):
+        best = self.seen_in_part(views[0], found.at(index.new_zeros(1)), past.usual, index)
+        if not (familiar(best, past.usual[index]) & beats(best, estimate.at(index))):
             return estimate
         radius = self.reference.place.radius[r]
         distance = pose_distance(best.pose[0], pose, radius=radius)
@@ -160,6 +176,11 @@ class Recovery:
             return estimate
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
+
+    def seen_in_part(self, view: Tensor, found: Estimate, usual: Tensor, index: Tensor) -> Estimate:
+        """Places ``found`` (n, ...) of templates at ``index`` (n,), looked at again as something may cover a part."""
+        again = solve(self.reference.select(index), view, found.pose, self.partly, None, usual[index])
+        return again._replace(origin=found.origin)
 
     def own(self, found: Estimate, before: Estimate, start: Tensor, past: Past) -> Estimate:
         """``found`` without the leaps from the ``start`` (R, 3) to where look-alikes of the templates may be as well:
@@ -194,8 +215,7 @@ class Recovery:
         if len(index) == 0:
             return estimate
         found = solve(self.reference.select(index), image, expected[index], self.settings)
-        known = (found.status == Status.CONVERGED) & within_margin(found.score, usual[index])
-        known &= ~good[index] | within_margin(found.score, estimate.score[index])
+        known = familiar(found, usual[index]) & (~good[index] | within_margin(found.score, estimate.score[index]))
         found = found._replace(origin=torch.full_like(found.origin, int(Origin.NEARBY)))
         return estimate.put(index[known], found.at(known))
 

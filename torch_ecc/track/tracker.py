@@ -21,8 +21,9 @@ from torch_ecc.core.pyramid import SMALLEST_COARSE, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, iterate
+from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
-from torch_ecc.track.recover import Past, Recovery, expected_score, suspect
+from torch_ecc.track.recover import Past, Recovery, disbelieved, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
@@ -47,7 +48,8 @@ class Tracker(nn.Module):
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
     the frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in the frame
-    it is out of view; ``search``: look for a template that is lost, or looks less like itself than usual, near where it
+    it is out of view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
+    (``core.robust``); ``search``: look for a template that is lost, or looks less like itself than usual, near where it
     is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
     more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or "native", see
     settings.Settings.
@@ -89,20 +91,20 @@ class Tracker(nn.Module):
         device: torch.device | str | None = None,
         min_score: float = 0.5,
         min_visible: float = 0.25,
+        robust: bool = True,
         search: bool = True,
         backend: str = "auto",
     ) -> None:
         super().__init__()
         if prediction not in PREDICTIONS:
             raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
-        self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, backend)
+        self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, robust, backend)
         self.prediction, self.search = prediction, search
         self.criterion = make_criterion(criterion, illumination)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
-        self.frame_shape = tuple(gray.shape)
+        self.frame_shape, self.levels = tuple(gray.shape), levels
         patches = locate_patches("Tracker", gray, centers, size, mask)
         _check_levels(levels, patches.size)
-        self.levels = levels
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
         none = torch.zeros_like(start[:, 0], dtype=torch.int64)
         for name, value in templates._asdict().items():
@@ -235,6 +237,7 @@ class Tracker(nn.Module):
             past = Past(*(state[name] for name in ("pose", "score", "suspect_frames", "first", "start")))
             estimate = self._recovery(images, estimate, start, past)
             suspects = suspect(estimate, state["score"])
+            estimate = disbelieved(estimate, suspects, start, past, self.references[0].place.radius)
         return self._advance_doubtful(estimate, suspects)
 
     def track(self, frame: Tensor) -> Estimate:
@@ -270,7 +273,8 @@ class Tracker(nn.Module):
             finer = self.references[level - 1], images[level - 1]
             better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
-        return solve(self.references[0], images[0], pose, self.settings, self._buffers["start"])
+        start, usual = self._buffers["start"], self._buffers["score"]
+        return solve(self.references[0], images[0], pose, self.settings, start, usual)
 
     def _advance(self, estimate: Estimate) -> Estimate:
         """One frame on, in which nothing is suspect: the next state, and the ``estimate``."""

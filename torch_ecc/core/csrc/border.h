@@ -1,5 +1,5 @@
-// Templates of which the frame shows only a part: pixels out of sight weigh nothing, and what depends on the weights is
-// made anew (core/reference.py: reweigh; core/normal.py: Moments).
+// Templates of which the frame shows only a part, or blocks are not trusted: pixels count less or nothing, and what
+// depends on the weights is made anew (core/reference.py: reweigh; core/normal.py: Moments).
 #pragma once
 #include <algorithm>
 #include <numeric>
@@ -16,9 +16,9 @@ struct Moments {  // normal.Moments
 
 inline const std::vector<int> SHAPE{4, MOST, MOST + 1, 3};  // 1, u, v and t among `columns` of R
 
-struct Border {  // what is known of the visible pixels `of` a template
+struct Border {  // what is known of the pixels `of` a template that count
   const Pixels* of = nullptr;
-  std::vector<float> weight, before, z, r;  // (height, pitch); columns of Z and R
+  std::vector<float> seen, weight, before, z, r;  // (height, pitch): in sight; as they count; columns of Z and R
   Moments moments;
   Weighted weighted;
 };
@@ -59,7 +59,7 @@ inline void columns(const Pixels& p, int plane, int count, std::vector<float>& o
   for (int64_t j = 0; j < p.height; ++j) {
     const int16_t* const image = p.plane(3 * plane) + j * p.pitch;
     const float y = float(p.n->top + double(j) * p.step), v = y / float(p.n->half[1]);
-    Vector x = across(p);
+    Vector x = first_x(p);
     for (int64_t i = 0; i < p.pitch; i += LANES, x += LANES * float(p.step)) {
       const Vector gx = slope * wide(image + i), gy = slope * wide(image + size + i), t = unit * wide(image + 2 * size + i);
       const Vector u = x / float(p.n->half[0]), lit = t + level, one = Vector{} + 1;
@@ -115,10 +115,12 @@ inline void means(Border& b) {
   b.weighted.contrast = std::sqrt(std::max(g[3][3] - g[0][3] * g[0][3] / g[0][0], 0.0));
 }
 
-// Weights of the pixels that the warp puts inside the frame, and what follows from them for the loop. False if none is.
+// Weights of the pixels that the warp puts inside the frame, as their blocks are trusted, and what follows from them for
+// the loop. False if none is.
 inline bool weigh(const Template& t, const Pixels& p, const Warp& warp, const Frame& frame, Border& b) {
   b.before.swap(b.weight);
   b.weight.assign(p.height * p.pitch, 0);
+  b.seen.assign(p.height * p.pitch, 0);
   float any = 0;
   for (int64_t j = 0; j < p.height; ++j) {
     const double py = p.n->top + double(j) * p.step, y0 = warp.y0 + warp.c * py, x0 = warp.x0 + warp.s * py;
@@ -127,8 +129,10 @@ inline bool weigh(const Template& t, const Pixels& p, const Warp& warp, const Fr
     clip(y0 - warp.s * p.n->left, -warp.s * p.step, double(frame.h - 1), first, last);
     const float* const of = p.weights.at + j * p.weights.pitch;
     if (!(first <= last)) continue;
-    for (int64_t i = int64_t(first); i <= int64_t(last); ++i)
-      any = std::max(any, b.weight[j * p.pitch + i] = of[i]);
+    for (int64_t i = int64_t(first); i <= int64_t(last); ++i) {
+      b.seen[j * p.pitch + i] = of[i];
+      any = std::max(any, b.weight[j * p.pitch + i] = of[i] * p.trusted(j, i));
+    }
   }
   if (!(any > 0)) return false;
   if (b.of == &p && b.before == b.weight) return true;

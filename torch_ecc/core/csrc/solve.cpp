@@ -5,7 +5,9 @@
 #include <ATen/ops/nonzero.h>
 #include <torch/library.h>
 
+#include <algorithm>
 #include <atomic>
+#include <optional>
 
 #include "solve.h"
 
@@ -41,12 +43,13 @@ struct Planes {  // packed.Packed: one grid of all templates
       require(weight, "weight", at::kFloat, {count, h, pitch});
   }
 
-  ecc::Pixels of(int64_t b) const {
+  ecc::Pixels of(int64_t b, const float* trust, int64_t across) const {
     const int64_t h = planes.size(2), pitch = planes.size(3);
     const bool even = weight.size(0) == 1 && weight.size(1) == 1;  // one row serves for all
     return {planes.const_data_ptr<int16_t>() + b * ecc::PLANES * h * pitch,
             reinterpret_cast<const ecc::Numbers*>(numbers.const_data_ptr<double>()) + b,
-            {weight.const_data_ptr<float>() + (even ? 0 : b * h * pitch), even ? 0 : pitch}, width, h, pitch, double(step)};
+            {weight.const_data_ptr<float>() + (even ? 0 : b * h * pitch), even ? 0 : pitch}, width, h, pitch, double(step),
+            trust, across};
   }
 };
 
@@ -59,18 +62,18 @@ ecc::Frame frame_of(const Tensor& image, int64_t b) {
                                 : ecc::Frame::F32};
 }
 
-// See core/native.py. Pose, error, iterations, gain, sums and total of solution.Solution; and of the templates that were
-// seen in part their index (n,) and moments (n, ...).
-std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorList grids,
-                          at::IntArrayRef widths, at::IntArrayRef steps, int64_t criterion, int64_t degree,
-                          int64_t max_iterations, double tolerance) {
-  const int64_t count = start.dim() ? start.size(0) : 0;
+// See core/native.py. Pose, error, iterations, gain, sums and total of solution.Solution; and of the templates of which
+// not all pixels counted their index (n,) and moments (n, ...). With trust of the templates at index, of these alone.
+std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorList grids, at::IntArrayRef widths,
+                          at::IntArrayRef steps, int64_t criterion, int64_t degree, int64_t max_iterations,
+                          double tolerance, const std::optional<Tensor>& trust, const std::optional<Tensor>& index) {
+  const int64_t templates = start.dim() ? start.size(0) : 0;
   const auto kind = image.scalar_type();
-  require(start.device().is_cpu() && start.scalar_type() == at::kDouble && start.sizes() == at::IntArrayRef({count, 3}),
+  require(start.device().is_cpu() && start.scalar_type() == at::kDouble && start.sizes() == at::IntArrayRef({templates, 3}),
           "pose must be float64 (B, 3) on the CPU, got ", start.scalar_type(), " ", start.sizes());
   require(image.device().is_cpu() && (kind == at::kByte || kind == at::kUInt16 || kind == at::kFloat) && image.dim() == 4 &&
-              (image.size(0) == 1 || image.size(0) == count) && image.size(1) == 1 && image.numel() > 0,
-          "image must be uint8, uint16 or float32, (1 or ", count, ", 1, H, W) on the CPU, got ", kind, " ", image.sizes());
+              (image.size(0) == 1 || image.size(0) == templates) && image.size(1) == 1 && image.numel() > 0,
+          "image must be uint8, uint16 or float32, (1 or ", templates, ", 1, H, W) on the CPU, got ", kind, " ", image.sizes());
   require(criterion == ecc::PAPER || criterion == ecc::SSD || criterion == 0 || criterion == 2 || criterion == 5,
           "criterion must be -2, -1, 0, 2 or 5, got ", criterion);
   require(degree == 1 || degree == 3 || degree == 5, "degree must be 1, 3 or 5, got ", degree);
@@ -79,14 +82,26 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
   const size_t n = grids.size() / 3;
   require(grids.size() == 3 * n && (n == 1 || n == 2) && widths.size() == n && steps.size() == n,
           "expected planes, weight, numbers, width and step of one or two grids");
-  const Planes all(grids.slice(0, 3), widths[0], steps[0], count);
-  const Planes coarse(grids.slice(3 * (n - 1), 3), widths[n - 1], steps[n - 1], count);
+  const Planes all(grids.slice(0, 3), widths[0], steps[0], templates);
+  const Planes coarse(grids.slice(3 * (n - 1), 3), widths[n - 1], steps[n - 1], templates);
   require(coarse.planes.size(2) <= all.planes.size(2) && coarse.planes.size(3) <= all.planes.size(3),
           "the second grid must not be larger than the first");
   const Tensor rows = image.stride(3) == 1 ? image : image.contiguous(), from = start.contiguous();
   const ecc::Settings settings{degree, max_iterations, tolerance};
   const auto blocks = [](int64_t n) { return (n + ecc::BLOCK - 1) / ecc::BLOCK; };
-  const int64_t each = blocks(all.planes.size(2)) * blocks(widths[0]);
+  const int64_t across = blocks(widths[0]), each = blocks(all.planes.size(2)) * across;
+  require(bool(trust) == bool(index), "trust and index come together");
+  require(steps[0] == 1 || !trust, "trust needs the first grid to have all pixels");
+  require((coarse.planes.size(2) - 1) * steps[n - 1] < all.planes.size(2) && (widths[n - 1] - 1) * steps[n - 1] < widths[0],
+          "the second grid must not reach beyond the first");
+  const int64_t count = index ? index->numel() : templates;
+  if (trust) {
+    require(*index, "index", at::kLong, {count});
+    require(*trust, "trust", at::kFloat, {count, each});
+    const int64_t* const first = index->const_data_ptr<int64_t>();
+    require(std::all_of(first, first + count, [&](int64_t b) { return b >= 0 && b < templates; }), "index must be 0 to ",
+            templates - 1);
+  }
   const auto real = from.options();
   const Tensor pose = at::empty({count, 3}, real), error = at::empty({count}, real),
                iterations = at::empty({count}, real.dtype(at::kLong)), gain = at::empty({count}, real),
@@ -98,15 +113,18 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
   at::parallel_for(0, std::min<int64_t>(count, at::get_num_threads()), 1, [&](int64_t, int64_t) {
     thread_local ecc::Scratch scratch;
     for (int64_t b = next++; b < count; b = next++) {
-      const ecc::Template t{criterion, criterion < 0 ? 3 : 5 + criterion, n == 2, all.of(b), coarse.of(b)};
-      const double* at = from.const_data_ptr<double>() + 3 * b;
+      const int64_t which = index ? index->const_data_ptr<int64_t>()[b] : b;
+      const float* const trusted = trust ? trust->const_data_ptr<float>() + b * each : nullptr;
+      const ecc::Template t{criterion, criterion < 0 ? 3 : 5 + criterion, n == 2, all.of(which, trusted, across),
+                            coarse.of(which, trusted, across)};
+      const double* at = from.const_data_ptr<double>() + 3 * which;
       ecc::State state{{at[0], at[1], at[2]}};
       float* const out = sums.data_ptr<float>() + b * ecc::SUMS * each;
-      const bool seen = ecc::solve(t, frame_of(rows, b), settings, state, scratch);
+      const bool seen = ecc::solve(t, frame_of(rows, which), settings, state, scratch);
       double* const of_all = total.data_ptr<double>() + b * (ecc::SUMS + 3);
       if (seen) {
         if (scratch.partial) ecc::complete(t, t.whole, scratch.border);
-        ecc::summed(t, t.whole, scratch.weights(t.whole), scratch.weighted(t.whole), scratch.patch.data(), scratch.model,
+        ecc::summed(t, t.whole, scratch.seen(t.whole), scratch.weighted(t.whole), scratch.patch.data(), scratch.model,
                     scratch.lines.data(), out, of_all);
       } else {
         scratch.border.moments = {};
@@ -125,8 +143,8 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
   const bool* const first = partial.const_data_ptr<bool>();
   if (std::none_of(first, first + count, [](bool each) { return each; }))
     return {pose, error, iterations, gain, sums, total, at::empty({0}, real.dtype(at::kLong)), moments};
-  const Tensor index = at::nonzero(partial).select(1, 0);
-  return {pose, error, iterations, gain, sums, total, index, moments.index_select(0, index)};
+  const Tensor anew = at::nonzero(partial).select(1, 0);
+  return {pose, error, iterations, gain, sums, total, anew, moments.index_select(0, anew)};
 }
 
 }  // namespace
@@ -134,7 +152,7 @@ std::vector<Tensor> solve(const Tensor& image, const Tensor& start, at::TensorLi
 TORCH_LIBRARY(torch_ecc, m) {
   m.def(
       "solve(Tensor image, Tensor pose, Tensor[] grids, int[] widths, int[] steps, int criterion, "
-      "int degree, int max_iterations, float tolerance) -> Tensor[]");
+      "int degree, int max_iterations, float tolerance, Tensor? trust=None, Tensor? index=None) -> Tensor[]");
 }
 
 TORCH_LIBRARY_IMPL(torch_ecc, CPU, m) { m.impl("solve", &solve); }

@@ -23,10 +23,11 @@ struct Scratch {  // of one thread, kept from call to call
   std::vector<float> patch, lines;  // (height, pitch), of the last look
   Border border;
   Model model;
-  bool partial;  // whether pixels were out of its sight
+  bool partial;  // whether pixels were out of its sight or not trusted
 
   const Weighted& weighted(const Pixels& p) const { return partial ? border.weighted : p.n->weighted; }
   Weights weights(const Pixels& p) const { return partial ? Weights{border.weight.data(), p.pitch} : p.weights; }
+  Weights seen(const Pixels& p) const { return partial ? Weights{border.seen.data(), p.pitch} : p.weights; }
 };
 
 // Of pixel positions relative to the template's centre.
@@ -56,7 +57,7 @@ bool find(const Template& t, const Pixels& p, const Frame& frame, const Warp& wa
   scratch.partial = !(low[0] >= -ECC_ROUNDING && low[1] >= -ECC_ROUNDING && high[0] <= double(frame.w - 1) + ECC_ROUNDING &&
                       high[1] <= double(frame.h - 1) + ECC_ROUNDING);
   const bool somewhere = std::isfinite(low[0] + high[0] + low[1] + high[1]);  // not if a corner is no number
-  scratch.partial = scratch.partial || !somewhere;
+  scratch.partial = scratch.partial || !somewhere || p.trust;
   if (scratch.partial && !(somewhere && weigh(t, p, warp, frame, scratch.border))) return false;
   Window& window = scratch.window;
   const double first = degree / 2, last = (degree + 1) / 2;

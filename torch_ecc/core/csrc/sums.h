@@ -37,7 +37,7 @@ void add_down(const Pixels& p, const Weights& weights, int64_t first, int64_t ro
   const float by_u = float(1 / p.n->half[0]), by_v = float(1 / p.n->half[1]);
   float b[MOST];
   for (int k = 0; k < MOST; ++k) b[k] = float(m.fit[k] * (k < 3 ? unit[2] : 1));
-  Vector x = across(p);
+  Vector x = first_x(p);
   for (int64_t i = 0; i < p.pitch; i += LANES, x += LANES * step) {
     Vector gx{}, gxy{}, gy{}, t[3]{}, one[3]{}, rest[7]{};
     const Vector u = x * by_u;
@@ -115,7 +115,8 @@ inline std::array<double, 2> rescaled(const Pixels& p, int k) {
 inline double finite(double value) { return std::isfinite(value) ? value : 0; }
 
 // sums (SUMS, blocks) of the last patch and its fit, as of solution.summed, and their total (SUMS + 3) over the blocks.
-inline void summed(const Template& t, const Pixels& p, const Weights& weights, const Weighted& w, const float* patch,
+// seen: the weights without trust.
+inline void summed(const Template& t, const Pixels& p, const Weights& seen, const Weighted& w, const float* patch,
                    Model& m, float* lines, float* sums, double* total) {
   const int64_t across = (p.width + BLOCK - 1) / BLOCK, count = across * ((p.height + BLOCK - 1) / BLOCK);
   const int n = t.lines();
@@ -128,7 +129,7 @@ inline void summed(const Template& t, const Pixels& p, const Weights& weights, c
   for (int64_t first = 0; first < p.height; first += BLOCK, sums += across) {
     const int64_t rows = std::min(BLOCK, p.height - first);
     for (int64_t j = 0; j < rows; ++j) fetch(p, first + BLOCK + j, 6);
-    add_down<true>(t, p, weights, first, rows, patch + first * p.pitch, m, lines);
+    add_down<true>(t, p, seen, first, rows, patch + first * p.pitch, m, lines);
     for (int64_t i = 0; i < p.pitch; i += LANES)
       for (int k = 0; k < 3; ++k) {  // K e
         Vector sum{};
@@ -140,16 +141,21 @@ inline void summed(const Template& t, const Pixels& p, const Weights& weights, c
         const float* const line = lines + (n + k) * p.line() + b * BLOCK;
         float sum = 0;
         for (int64_t i = 0; i < BLOCK; ++i) sum += line[i];
-        sums[k * count + b] = sum;
+        sums[k * count + b] = k >= SUMS - 3 && p.trust ? sum * p.trust[first / BLOCK * across + b] : sum;  // K is less
       }
   }
   sums -= count;
-  const double level = m.mean + m.base, power = std::accumulate(sums + 2 * count, sums + 3 * count, 0.0);
+  const auto added = [&](int k) {
+    const float* const row = sums + k * count;
+    return k < SUMS - 3 && p.trust ? std::inner_product(row, row + count, p.trust, 0.0) : std::accumulate(row, row + count, 0.0);
+  };
+  const double level = m.mean + m.base, power = added(2);
   if (!(power > ECC_FLAT * (power + level * level * w.total)))  // of a patch that is flat but for rounding g0 is 0
     std::fill_n(sums + count, 5 * count, 0.f);
-  for (int k = 0; k < SUMS; ++k, sums += count) {
-    total[k] = finite(std::accumulate(sums, sums + count, 0.0));
-    if (k >= SUMS - 3) total[k + 3] = finite(std::inner_product(sums, sums + count, sums, 0.0));
+  for (int k = 0; k < SUMS; ++k) {
+    const float* const row = sums + k * count;
+    total[k] = finite(added(k));
+    if (k >= SUMS - 3) total[k + 3] = finite(std::inner_product(row, row + count, row, 0.0));
   }
 }
 

@@ -41,6 +41,12 @@ struct Pixels {  // of one template, all of them or those of every step-th row a
   Weights weights;
   int64_t width, height, pitch;
   double step;
+  const float* trust;  // solution.Trust, of blocks of the whole template, `across` of them side by side; null if whole
+  int64_t across;
+
+  float trusted(int64_t row, int64_t column) const {
+    return trust ? trust[row * int64_t(step) / BLOCK * across + column * int64_t(step) / BLOCK] : 1;
+  }
 
   const int16_t* plane(int k) const { return planes + k * height * pitch; }
   int64_t line() const { return pitch + LANES; }  // from one line of sums to the next: a block may reach beyond a row
@@ -62,7 +68,7 @@ inline Vector wide(const int16_t* from) {
 }
 
 // x' of the first pixels of a row.
-inline Vector across(const Pixels& p) {
+inline Vector first_x(const Pixels& p) {
   Vector x;
   for (int k = 0; k < LANES; ++k) x[k] = float(p.n->left + k * p.step);
   return x;

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_ecc.sim.camera import optics, sensor
 from torch_ecc.sim.camera.light import Light
 from torch_ecc.sim.camera.occluder import Occluder
-from torch_ecc.sim.scene.scene import Scene
+from torch_ecc.sim.scene.scene import Rendered
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class Camera:
             raise ValueError(f"Camera: bits must be 8, 16 or None, got {self.bits}")
 
     def capture(
-        self, scene: Scene, poses: Tensor, *, velocities: Tensor | None = None, seed: int = 0, first: int = 0
+        self, scene: Rendered, poses: Tensor, *, velocities: Tensor | None = None, seed: int = 0, first: int = 0
     ) -> Tensor:
         """Frames (B, 1, h, w) at poses (B, 3), on their device: uint8, uint16 or float32 by ``bits``.
 
@@ -64,7 +64,7 @@ class Camera:
         indices = torch.arange(first, first + len(poses), device=poses.device)
         return self._sense(self._image(scene, poses, velocities, indices), indices, seed)
 
-    def _image(self, scene: Scene, poses: Tensor, velocities: Tensor | None, indices: Tensor) -> Tensor:
+    def _image(self, scene: Rendered, poses: Tensor, velocities: Tensor | None, indices: Tensor) -> Tensor:
         """The noise-free image on the sensor: (B, 3) -> (B, 1, h, w) float32."""
         margin = optics.margin(self.blur_sigma, self.defocus_radius)
         padded = (self.size[0] + 2 * margin, self.size[1] + 2 * margin)

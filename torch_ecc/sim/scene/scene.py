@@ -20,7 +20,15 @@ from torch_ecc.sim.scene.waves import PlaneWaves
 __all__ = ["Pads", "PlaneWaves", "Scene", "Speckle", "Sum"]
 
 
-class Scene(Protocol):
+class Rendered(Protocol):
+    """Anything that a camera can be put before."""
+
+    def render(self, poses: Tensor, size: tuple[int, int]) -> Tensor:
+        """Frames of ``size`` = (h, w) at poses (B, 3): (B, 1, h, w) float32 on the poses' device."""
+        ...
+
+
+class Scene(Rendered, Protocol):
     """Anything with an exact value and gradient at real coordinates and a fast rendering of the same function."""
 
     def value(self, points: Tensor) -> Tensor:
@@ -29,10 +37,6 @@ class Scene(Protocol):
 
     def gradient(self, points: Tensor) -> Tensor:
         """Gradient at scene points, grey levels per px: (..., 2) float64 -> (..., 2) float64."""
-        ...
-
-    def render(self, poses: Tensor, size: tuple[int, int]) -> Tensor:
-        """Frames of ``size`` = (h, w) at poses (B, 3): (B, 1, h, w) float32 on the poses' device."""
         ...
 
 

@@ -12,13 +12,18 @@ from torch import Tensor
 
 from torch_ecc.core.align import align
 from torch_ecc.core.estimate import Estimate
+from torch_ecc.core.pose import inverse, transform
 from torch_ecc.core.reference import MARGIN
-from torch_ecc.paper.bound import cramer_rao, oracle, rounding
+from torch_ecc.paper.bound import cramer_rao, rounding
 from torch_ecc.paper.errors import rms
 from torch_ecc.paper.methods import prepared
 from torch_ecc.paper.scheme import SIZE, Cut
 from torch_ecc.sim import Camera, Scene
+from torch_ecc.sim.camera.sensor import WHITE
 
+NUDGE = 1 / 64  # px: half the base of the oracle's difference quotients
+SETTLED = 1e-6  # px: the last step of an oracle that has its answer
+STEPS = 30  # at most; it takes two or three from nearby
 BATCH = 50  # pairs that are aligned at once
 ROOM = 40  # px that a frame is larger than the template and its surroundings, on each side
 FRAME = SIZE + 2 * MARGIN + 2 * ROOM
@@ -122,3 +127,37 @@ def least(scene: Scene, draws: Draws) -> Tensor:
         )
         errors.append(Cut(first, MIDDLE).truth(second) - pair.truth)
     return torch.cat(errors)
+
+
+def oracle(scene: Scene, frame: Tensor, start: Tensor, size: tuple[int, int]) -> Tensor:
+    """The pose (3,) px, px, rad at which ``scene``, known exactly, fits a ``frame`` (H, W) best: least squares.
+
+    Only the pose is unknown, no template was ever rounded and nothing is interpolated. Of the frame, uint8, uint16 or
+    grey levels of 0..255, counts what a template (h, w) at ``start`` (3,), some tenths of a px off, covers.
+    Gauss-Newton steps with the slopes at ``start``.
+    """
+    half = start.new_tensor(size[::-1]) / 2
+    turn = torch.stack((start[2].cos().abs(), start[2].sin().abs()))
+    reach = torch.stack((turn @ half, turn.flip(0) @ half))
+    (left, top), (right, bottom) = ((start[:2] + side * (reach + 1)).long().clamp(min=0).tolist() for side in (-1, 1))
+    level = 1.0 if frame.is_floating_point() else WHITE / torch.iinfo(frame.dtype).max
+    frame, pose = level * frame[top : bottom + 1, left : right + 1].double(), start - start.new_tensor((left, top, 0.0))
+    grid = torch.cartesian_prod(*(torch.arange(n, dtype=start.dtype) for n in frame.shape)).flip(-1)
+    covered = (transform(inverse(pose), grid).abs() <= half).all(-1)
+    grid, seen = grid[covered], frame.flatten()[covered]
+    nudge = NUDGE * start.new_tensor([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    around, (x, y) = _values(scene, pose + nudge, frame, covered), (grid - pose[:2]).unbind(-1)
+    gx, gy = ((around[k] - around[k + 1]) / (2 * NUDGE) for k in (0, 2))
+    J = torch.stack((gx, gy, gx * y - gy * x), -1)  # of the frame by the pose, eq. (2)
+    fit = torch.linalg.solve(J.mT @ J, J.mT)
+    for _ in range(STEPS):
+        step = fit @ (seen - _values(scene, pose[None], frame, covered)[0])
+        pose = pose + step
+        if float(step[:2].abs().max()) < SETTLED:
+            break
+    return pose + start.new_tensor((left, top, 0.0))
+
+
+def _values(scene: Scene, poses: Tensor, frame: Tensor, covered: Tensor) -> Tensor:
+    """What a ``frame`` (H, W) of ``scene`` at ``poses`` (n, 3) shows where ``covered`` (H W,): (n, N) float64."""
+    return scene.render(poses, (frame.shape[0], frame.shape[1])).flatten(1)[:, covered].double()

@@ -1,0 +1,114 @@
+"""Laws of the hostile benchmark: its films keep their truth, it counts right, and undisturbed all is right."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import honesty
+import hostile
+from films import covers, disturbed, repeats
+from films.shot import SCENES, Film, Shot, eq11, frames, visible_bound
+from results import load
+
+from torch_ecc import Status
+from torch_ecc.paper.bound import cramer_rao
+from torch_ecc.sim import PlaneWaves
+
+SHORT = eq11(frames(12))
+
+
+@pytest.fixture(scope="module")
+def shot() -> Shot:
+    return Shot(SCENES["waves"](0), path=SHORT, size=61, frame=(360, 460))
+
+
+def test_undisturbed_all_is_right_at_the_bound(shot: Shot) -> None:
+    found = honesty.figures([honesty.follow(shot.film(shot.clean))])
+    assert found["right"] == found["frames"] == len(SHORT) - 1
+    assert found["wrong"] == found["off"] == found["lost"] == 0
+    assert found["bound"] < 2
+    assert found["sigma"] < 2
+
+
+@pytest.mark.parametrize("motion", covers.MOTIONS)
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_strip_covers_the_share_it_says(motion: str, seed: int) -> None:
+    shot = Shot(PlaneWaves.random(9), seed, size=61, frame=(310, 410))
+    _, opacity = covers.covered(shot, 0.2, "flat", motion)
+    share = 1 - shot.inside(opacity < 0.5).double().mean(1)
+    assert float(share.max()) == pytest.approx(0.2, abs=0.02)
+    assert share[0] == share[-1] == 0
+
+
+def test_what_is_seen_bounds_the_error(shot: Shot) -> None:
+    """All of it: the bound of the paper; half of it: more; a strip that a wave runs along: nothing fixes the pose."""
+    t, J = shot.slopes
+    whole = visible_bound(t, J, torch.full((1, len(t)), 1 / 8.0)).diagonal(dim1=1, dim2=2).sqrt()[0]
+    torch.testing.assert_close(whole, cramer_rao(shot.scene, (61, 61), 8.0))
+    half = torch.arange(len(t))[None] < len(t) // 2
+    assert bool((visible_bound(t, J, half / 8.0).diagonal(dim1=1, dim2=2).sqrt()[0] > whole).all())
+    assert bool(visible_bound(t, J, torch.zeros(1, len(t))).isinf().all())
+
+
+def test_rows_at_one_pose_are_a_picture(shot: Shot) -> None:
+    image = disturbed.by_rows(shot, lambda k, row: shot.path[k])
+    torch.testing.assert_close(image, shot.clean, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("family", SCENES)
+def test_a_scaled_scene_is_the_same_farther_out(family: str) -> None:
+    scene, points = SCENES[family](0), 40 * torch.randn(20, 2, generator=torch.Generator().manual_seed(0)).double()
+    torch.testing.assert_close(disturbed.scaled(scene, 1.1).value(1.1 * points), scene.value(points))
+
+
+def test_every_disturbance_gives_a_film() -> None:
+    """Of the same shape, with a truth for every frame, and none changes the first frame's place."""
+    shot = Shot(PlaneWaves.random(20), path=eq11(frames(34)), size=31, frame=(320, 420))
+    for name, disturb in hostile.disturbances().items():
+        if name.startswith(("cover 10", "twin", "turns", "salt", "lost", "fixed", "noise in r", "photons 30")):
+            film = disturb(shot)
+            assert film.frames.dtype == torch.uint8, name
+            assert film.frames.shape == (len(shot.path), 1, *shot.frame), name
+            assert film.truth.isfinite().all(), name
+            assert film.seen.shape == film.truth.shape[:2] == (len(shot.path) - 1, 1), name
+            assert torch.equal(film.centers, shot.path[:1, :2]), name
+
+
+def test_counts(shot: Shot) -> None:
+    """Right, off within its sigma, wrong, far and wrong, disbelieved, lost; nothing disturbs the last four."""
+    n = 6
+    truth = torch.zeros(n, 1, 3, dtype=torch.float64)
+    film = Film(shot.clean[:0], truth[0, :, :2], 61, truth, torch.ones(n, 1), torch.ones_like(truth), 2)
+    error, sigma = torch.zeros(n, 1, 3), torch.full((n, 1, 3), 0.01)
+    error[:, 0, 0] = torch.tensor([0.05, 0.2, 0.2, 3.0, 0.01, 9.0])
+    sigma[1] = 0.1
+    status = torch.tensor([0, 0, 0, 0, Status.MAX_ITERATIONS, Status.LOST], dtype=torch.int8)[:, None]
+    found = honesty.figures([honesty.Run(film, error, sigma, status, status, status, status, torch.ones(n))])
+    counts = {"converged": 4, "right": 1, "off": 3, "wrong": 2, "far": 1, "after": 2, "disbelieved": 1, "lost": 1}
+    assert {name: found[name] for name in counts} == counts
+    assert found["recovery"] == math.inf
+
+
+def test_parts_that_cross_are_seen_and_hidden() -> None:
+    film = next(iter(repeats.crossings(1)))
+    assert film.truth.shape == (repeats.CROSSING - 1, 2, 3)
+    assert float(film.seen[:, 0].min()) < 0.5
+    assert bool((film.seen[:, 1] == 1).all())
+
+
+def test_one_row_by_one_command(tmp_path: Path) -> None:
+    out = tmp_path / "hostile.json"
+    done = CliRunner().invoke(hostile.main, ["--quick", "--rows", "leap", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert load(out).figures["leap / frames"].value == 90
+    refused = CliRunner().invoke(hostile.main, ["--rows", "no such row"])
+    assert refused.exit_code == 2
+    assert "known are none, cover 5 %" in refused.output

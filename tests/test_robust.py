@@ -1,0 +1,165 @@
+"""What covers a part of a template bends no pose: blocks that do not fit count less, and how many is told."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from engines import BACKENDS
+from torch import Tensor
+
+from torch_ecc import Status, Tracker, align, prepare
+from torch_ecc.core.robust import quantile, trust, weighted_median
+from torch_ecc.sim.scene.micrograph import micrograph
+from torch_ecc.sim.scene.pads import Pads
+from torch_ecc.sim.scene.speckle import Speckle
+from torch_ecc.sim.scene.waves import PlaneWaves
+
+SIZE, FRAME, MIDDLE = 121, (200, 210), (104.3, 99.6)
+SCENES = {
+    "waves": PlaneWaves.random(seed=3),
+    "pads": Pads.wafer(seed=1),
+    "speckle": Speckle.random(seed=2),
+    "micrograph": micrograph(4),
+}
+PATH = torch.tensor([[0, 0, 0], [1.3, -0.8, 0.01], [2.9, -1.2, 0.03], [4.1, -0.4, 0.04]], dtype=torch.float64)
+scenes = pytest.mark.parametrize("scene", SCENES)
+backends = pytest.mark.parametrize("backend", BACKENDS)
+
+
+def shots(scene: str) -> tuple[Tensor, Tensor]:
+    """Clean frames (F, H, W) and where the template is in them."""
+    poses = PATH + torch.tensor([*MIDDLE, 0.0], dtype=torch.float64)
+    return SCENES[scene].render(poses, FRAME)[:, 0].float(), poses
+
+
+def noisy(frames: Tensor, sigma: float = 2.0, seed: int = 0) -> Tensor:
+    """As a camera gives them."""
+    noise = torch.randn(frames.shape, generator=torch.Generator().manual_seed(seed))
+    return (frames + sigma * noise).round().clamp(0, 255).to(torch.uint8)
+
+
+def covered(frames: Tensor, share: float, what: str) -> Tensor:
+    """A strip over ``share`` of the template in all frames but the first."""
+    left = round(MIDDLE[0] - SIZE / 2)
+    width = round(share * SIZE)
+    texture = PlaneWaves.random(seed=77).render(torch.zeros(1, 3, dtype=torch.float64), FRAME)[0, 0].float()
+    strip = {"dark": 0 * texture + 30, "mean": 0 * texture + frames.mean(), "texture": texture}[what]
+    out = frames.clone()
+    out[1:, :, left - 4 : left + width] = strip[:, left - 4 : left + width]
+    return out
+
+
+def errors(frames: Tensor, poses: Tensor, **options: object) -> tuple[Tensor, object]:
+    """In px (at the template's corner for theta), (F, 3), and the track."""
+    track = Tracker(frames[0], [MIDDLE], SIZE, **options).track_sequence(frames[1:])
+    return (track.pose[:, 0] - poses[1:]) * torch.tensor([1, 1, SIZE / 2**0.5]), track
+
+
+@backends
+@scenes
+@pytest.mark.parametrize("what", ["dark", "mean", "texture"])
+@pytest.mark.parametrize("share", [0.05, 0.15, 0.3])
+def test_what_covers_a_part_bends_no_pose(scene, what, share, backend):
+    """Right to what noise makes of the rest, and what is told of it is near the truth."""
+    frames, poses = shots(scene)
+    error, track = errors(noisy(covered(frames, share, what)), poses, backend=backend)
+    assert (track.status == Status.CONVERGED).all()
+    assert error.abs().max() < 0.06
+    assert (track.coverage[:, 0] < 1 - 0.4 * share).all()
+    assert (track.coverage[:, 0] > 1 - share - 0.14).all()
+    assert ((track.pose[:, 0] - poses[1:]).abs() < 5 * track.sigma[:, 0]).all()
+
+
+@scenes
+def test_without_a_cover_it_is_least_squares(scene):
+    """To the last digit, whatever the noise."""
+    frames, _ = shots(scene)
+    for sigma in (0.0, 2.0, 8.0):
+        robust, plain = (
+            Tracker(frames_[0], [MIDDLE], SIZE, robust=on).track_sequence(frames_[1:])
+            for on, frames_ in ((on, noisy(frames, sigma)) for on in (True, False))
+        )
+        assert torch.equal(robust.pose, plain.pose), sigma
+        assert (robust.coverage == 1).all()
+
+
+@scenes
+def test_more_noise_than_ever_is_not_taken_for_a_cover(scene):
+    """A template that was averaged over many images, in frames as they come."""
+    frames, poses = shots(scene)
+    stack = torch.cat((noisy(frames[:1], 0.2), noisy(frames[1:], 6.0)))
+    _, track = errors(stack, poses)
+    assert (track.status == Status.CONVERGED).all()
+    assert (track.coverage > 0.97).all()
+
+
+@backends
+@pytest.mark.parametrize("what", ["dark", "texture"])
+def test_where_most_is_covered_nothing_is_believed(what, backend):
+    for scene in SCENES:
+        frames, poses = shots(scene)
+        error, track = errors(noisy(covered(frames, 0.7, what)), poses, backend=backend, search=False)
+        believed = track.status[:, 0] == Status.CONVERGED
+        assert (error[believed].abs().amax(1, keepdim=True) < 0.1).all()
+        assert not believed.all()
+
+
+def test_light_does_not_change_what_is_believed():
+    """Gain and offset of a frame leave pose and coverage as they are."""
+    frames, poses = shots("waves")
+    stack = covered(frames, 0.2, "texture") + 2 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(1))
+    half = (SIZE - 1) // 2
+    x, y = (round(v) for v in MIDDLE)
+    reference = prepare(stack[None, None, 0, y - half : y + half + 1, x - half : x + half + 1])
+    plain, lit = (align(reference, g[None, None], poses[1:2]) for g in (stack[1], 0.6 * stack[1] + 40))
+    torch.testing.assert_close(lit.pose, plain.pose, atol=1e-3, rtol=0)
+    torch.testing.assert_close(lit.coverage, plain.coverage, atol=2e-2, rtol=0)
+
+
+@backends
+def test_a_covered_template_bears_on_no_other(backend):
+    frames, _ = shots("waves")
+    stack = noisy(covered(frames, 0.2, "texture"))
+    centers = [MIDDLE, (140.0, 100.0), (135.0, 130.0)]
+    together = Tracker(stack[0], centers, 61, backend=backend).track_sequence(stack[1:])
+    for r, center in enumerate(centers):
+        alone = Tracker(stack[0], [center], 61, backend=backend).track_sequence(stack[1:])
+        torch.testing.assert_close(together.pose[:, r], alone.pose[:, 0], atol=1e-4, rtol=0)
+        torch.testing.assert_close(together.coverage[:, r], alone.coverage[:, 0], atol=1e-3, rtol=0)
+
+
+def test_what_was_hidden_is_found_again_behind_what_is_left_of_the_cover():
+    frames, poses = shots("micrograph")
+    hidden, part = covered(frames, 1.0, "dark"), covered(frames, 0.3, "dark")
+    stack = noisy(torch.stack((frames[0], hidden[1], hidden[2], part[3])))
+    track = Tracker(stack[0], [MIDDLE], SIZE).track_sequence(stack[1:])
+    assert (track.status[:2, 0] == Status.LOST).all()
+    assert track.status[2, 0] == Status.CONVERGED
+    assert (track.pose[2, 0] - poses[3])[:2].abs().max() < 0.05
+
+
+def test_trust_falls_with_what_is_too_much():
+    ratio = torch.tensor([[0.0, 1.0, 3.0, 3.3, 6.0, 30.0, math.inf]])
+    value = trust(ratio)[0]
+    assert value[:3].tolist() == [1, 1, 1]
+    assert value.diff()[2:].max() <= 0
+    assert value[-2:].tolist() == [0, 0]
+
+
+def test_a_quantile_and_a_median_no_cover_can_raise():
+    """Half of the values may be anything."""
+    draw = torch.Generator().manual_seed(0)
+    values = torch.rand(3, 100, generator=draw) + 1
+    spoilt = values.clone()
+    spoilt[:, ::2] = 1e6
+    used = torch.ones_like(values, dtype=torch.bool)
+    assert (quantile(spoilt, used) < 2.4).all()
+    assert (quantile(values, used & (values > 1.5)) > 1.5).all()
+    weight = torch.ones_like(values)
+    weight[:, ::2] = 0.9
+    assert (weighted_median(spoilt, weight) < 2.01).all()
+    torch.testing.assert_close(
+        weighted_median(values[:, :99], weight[:, :99] * 0 + 1), values[:, :99].median(1, True).values
+    )

@@ -1,0 +1,258 @@
+"""Robust solve: where blocks of a patch do not fit, they are trusted less, by iteratively re-weighted least squares.
+
+What covers a part of a template leaves residuals there that no noise explains; whole blocks of pixels show that where
+single pixels do not. Least squares is tried first: if all blocks fit alike, that is the answer. Else each block's trust
+follows from its residual, at first at the start and under a model that a minority of blocks cannot bend (medians), then
+where the engine comes to with that trust, until it settles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.normal import LEAST, Normal
+from torch_ecc.core.reference import BLOCK, Blocks, Reference, each
+from torch_ecc.core.sampling import is_cpu
+from torch_ecc.core.settings import Settings
+from torch_ecc.core.solution import Solution, Trust
+from torch_ecc.core.verdict import correlation, expected_score, within_margin
+
+Engine = Callable[[Reference, Tensor, Tensor, Settings, Trust | None], Solution]  # ``solver.solve``, ``native.solve``
+
+OUTLIER = 3.0  # times the variance that is expected of a block: beyond it less and less is believed
+DISTRUST = 3.0  # trust = (OUTLIER / ratio)^this
+NO_TRUST = 0.02  # less is none
+QUANTILE, TO_MEDIAN = 0.3, 1.13  # of the blocks' variances: a scale that covers of well over half cannot raise
+LEAST_SLIP, SLIP = 0.00125, 0.045  # px^2 / 2: blocks may seem to have slipped by 0.05 px rms, as of the sampler,
+FIRST_SLIP = 1.0  # to 0.3 px; before the solve by more
+LARGEST_SLIP = 0.5  # where all do, as of blur, nothing need cover any of them
+LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
+SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
+ROUNDS = 5
+FITS = 1.6  # as ``cost`` counts: well believed by more than half, and nothing else is tried
+BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
+SETTLED = 0.01  # of the template's weight: trust changes no more
+
+
+class Scale(NamedTuple):
+    """The variance expected per pixel of a block: ``noise`` + ``slip`` * (mean square of its slopes), (B, 1) each."""
+
+    noise: Tensor
+    slip: Tensor
+
+
+class Doubted(NamedTuple):
+    """Templates at ``which`` (n,) of a solve by an ``engine`` that are solved again: what they have in their blocks,
+    the ``floor`` (n, 1) of the noise's variance and their ``usual`` (n,) score."""
+
+    engine: Engine
+    reference: Reference
+    image: Tensor
+    settings: Settings
+    which: Tensor
+    blocks: Blocks
+    floor: Tensor
+    usual: Tensor
+
+    @staticmethod
+    def of(engine: Engine, reference: Reference, image: Tensor, settings: Settings, usual: Tensor) -> Doubted:
+        """All of them."""
+        which = torch.arange(len(usual), device=usual.device)
+        return Doubted(engine, reference, image, settings, which, reference.blocks, least_noise(reference), usual)
+
+    def at(self, part: Tensor) -> Doubted:
+        """Some of them."""
+        blocks = each(lambda value: value[part], self.blocks)
+        return self._replace(which=self.which[part], blocks=blocks, floor=self.floor[part], usual=self.usual[part])
+
+    def solve(self, start: Tensor, settings: Settings, trusted: Tensor) -> Solution:
+        """From ``start`` (B, 3) on, with blocks (n, blocks) as they are trusted."""
+        return self.engine(self.reference, self.image, start, settings, Trust(self.which, trusted))
+
+
+def solve(
+    engine: Engine, reference: Reference, image: Tensor, start: Tensor, settings: Settings, usual: Tensor | None = None
+) -> Solution:
+    """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on; ``usual`` (B,): their scores so far."""
+    found = engine(reference, image, start, settings, None)
+    if not settings.robust:
+        return found
+    usual, on_cpu = expected_score(reference) if usual is None else usual, is_cpu(start.device)
+    odd = unusual(reference, found, usual)
+    if on_cpu and not odd.any():
+        return found
+    doubted, plain = Doubted.of(engine, reference, image, settings, usual), found
+    if on_cpu:  # nowhere else does the host ask which ones
+        doubted, plain = doubted.at(odd), each(lambda value: value[odd], found)
+    uneven = has_outliers(doubted, plain)
+    doubtful = uneven | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
+    if on_cpu:
+        if not doubtful.any():
+            return found
+        doubted, plain = doubted.at(doubtful), each(lambda value: value[doubtful], plain)
+        uneven, doubtful = uneven[doubtful], doubtful[doubtful]
+    again, left = solved_again(doubted, start, plain)
+    # Noise may have grown in all of the patch: then least squares is right, and leaving out most of it is not.
+    again = chosen(doubtful & (uneven | (left < FITS)), again, plain._replace(trust=torch.ones_like(plain.sums[:, 0])))
+    found = found._replace(trust=torch.ones_like(found.sums[:, 0]))
+    return each(lambda old, new: old.index_copy(0, doubted.which, new), found, again)
+
+
+def unusual(reference: Reference, found: Solution, usual: Tensor) -> Tensor:
+    """Which templates (B,) have blocks with residuals that would be too much even for noise as it is ``usual`` (B,):
+    others need no scale of this frame's own."""
+    most = usual_variance(found.normal, found.gain, usual) * OUTLIER
+    return ~((residual_variance(found.sums) * reference.blocks.enough).amax(1) <= most)  # NaN is unusual
+
+
+def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
+    """Which templates (n,) have blocks that fit far worse than others."""
+    most = Scale(doubted.floor + inf, torch.full_like(doubted.floor, LARGEST_SLIP))
+    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
+    return ~(ratio <= OUTLIER).all(1)
+
+
+def solved_again(doubted: Doubted, start: Tensor, plain: Solution) -> tuple[Solution, Tensor]:
+    """The best, and its ``cost`` (n,), of what trust leads to that begins with the residuals of least squares, or with
+    those under a median fit, at the ``start`` (B, 3) or where least squares has come to; what has slid away is none."""
+    there = start.index_copy(0, doubted.which, plain.pose)
+    here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
+    variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
+    first = compared(doubted, variance, seen, usual_scale(doubted, plain, plain.gain.unsqueeze(1), SLIP))
+    best, least = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain)
+    for place, begin in ((there, first), (start, None), (there, None)):
+        found = reweighted(doubted, place, begin or median_look(doubted, place))
+        price = cost(doubted, found)
+        near = torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < BASIN
+        better = (price < least) & near
+        best, least = chosen(better, found, best), torch.where(better, price, least)
+        if is_cpu(start.device) and bool((least < FITS).all()):
+            break
+    return best, least
+
+
+def cost(doubted: Doubted, found: Solution) -> Tensor:
+    """What is left of templates (n,), in blocks at most OUTLIER times what is usual: the mean over their weight, 1 if
+    all is noise and OUTLIER if nothing fits (the truncated squares that re-weighting makes least)."""
+    seen = found.sums[:, 0]
+    scale = usual_scale(doubted, found, found.gain.unsqueeze(1), LEAST_SLIP)
+    ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(0, OUTLIER)
+    value = (ratio.nan_to_num(OUTLIER) * seen).sum(1) / seen.sum(1).clamp(min=LEAST)
+    return torch.where(found.gain > 0, value, OUTLIER)
+
+
+def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:
+    """Scale and excess (n, blocks) under a median fit at ``place`` (B, 3)."""
+    look = doubted.solve(place, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
+    variance, gain = median_fit(look.sums, doubted.blocks)
+    return compared(doubted, variance, look.sums[:, 0], usual_scale(doubted, look, gain, FIRST_SLIP))
+
+
+def reweighted(doubted: Doubted, place: Tensor, first: tuple[Scale, Tensor]) -> Solution:
+    """Solved from their ``place`` (B, 3) on, with trust that begins with the ``first`` scale and excess and settles."""
+    blocks, (scale, ratio) = doubted.blocks, first
+    after = trust(ratio)
+    for _ in range(ROUNDS):
+        before = after
+        found = doubted.solve(place, doubted.settings, before)
+        most = Scale(scale.noise, scale.slip.clamp(max=SLIP))  # no cover may talk itself in
+        scale, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
+        after = trust(ratio)
+        change = ((after - before).abs() * blocks.weight).sum(1)
+        if is_cpu(place.device) and bool((change <= SETTLED * blocks.weight.sum(1)).all()):
+            break
+        place = place.index_copy(0, doubted.which, found.pose)
+    return found._replace(trust=before)
+
+
+def usual_scale(doubted: Doubted, found: Solution, gain: Tensor, slip: float) -> Scale:
+    """The scale of templates seen with a ``gain`` (n, 1) if their noise is the usual one."""
+    noise = usual_variance(found.normal, gain[:, 0], doubted.usual).to(doubted.floor.dtype)
+    return Scale(noise.unsqueeze(1).maximum(doubted.floor), torch.full_like(doubted.floor, slip))
+
+
+def compared(doubted: Doubted, variance: Tensor, seen: Tensor, most: Scale) -> tuple[Scale, Tensor]:
+    """The scale, at ``most`` so large, and the ``variance`` (n, blocks) of blocks over what it lets expect."""
+    scale = robust_scale(variance, doubted.blocks, seen, doubted.floor, most)
+    return scale, excess(variance, doubted.blocks, seen, scale)
+
+
+def usual_variance(normal: Normal, gain: Tensor, usual: Tensor) -> Tensor:
+    """The residual variance (B,) of templates seen with a ``gain`` (B,) whose score s is the ``usual`` (B,) one: the
+    share 1 - s^2 of their own."""
+    return (1 - usual * usual) * gain.square() * normal.energy / normal.total.clamp(min=LEAST)
+
+
+def chosen(better: Tensor, new: Solution, old: Solution) -> Solution:
+    """Of n templates the ``new`` answer where it is ``better`` (n,)."""
+    return each(lambda a, b: torch.where(better.view(-1, *[1] * (a.dim() - 1)), a, b), new, old)
+
+
+def trust(ratio: Tensor) -> Tensor:
+    """How much is believed of blocks (B, n) whose variance is ``ratio`` times what is expected: 1, or falling to 0."""
+    weight = (OUTLIER / ratio.clamp(min=OUTLIER)).pow(DISTRUST)
+    return torch.where(weight < NO_TRUST, 0.0, weight)
+
+
+def excess(variance: Tensor, blocks: Blocks, seen: Tensor, scale: Scale) -> Tensor:
+    """Residual ``variance`` (B, n) of blocks over what is expected; of those with less weight ``seen`` (B, n) than that
+    of a block's pixels by as much less over 1 as noise scatters more in them."""
+    ratio = variance / torch.addcmul(scale.noise, scale.slip, blocks.slope)
+    return (ratio - 1).mul_((seen / BLOCK**2).clamp_(max=1).sqrt_()).add_(1)
+
+
+def least_noise(reference: Reference) -> Tensor:
+    """Variance (B, 1) that noise has at least: that of the template's, or next to nothing of its contrast."""
+    contrast = reference.normal.energy / reference.normal.total.clamp(min=LEAST)
+    least = torch.maximum(reference.noise.power, LEAST_NOISE**2 * contrast)
+    return least.to(reference.K.dtype).unsqueeze(1)
+
+
+def residual_variance(sums: Tensor) -> Tensor:
+    """Mean square (B, n) of each block's residuals from the sums (B, 10, n)."""
+    return sums[:, 6] / sums[:, 0].clamp(min=LEAST)
+
+
+def robust_scale(variance: Tensor, blocks: Blocks, seen: Tensor, floor: Tensor, most: Scale) -> Scale:
+    """The scale of block variances (B, n): noise from the flatter half of the blocks, slip from the others.
+
+    ``seen`` (B, n): weight in sight; ``floor`` (B, 1): the least noise; ``most``: the largest scale.
+    """
+    there = seen > SEEN * blocks.weight
+    noise = quantile(variance, blocks.flat & there).minimum(most.noise).maximum(floor)
+    slip = quantile((variance - noise) / blocks.slope.clamp(min=LEAST), blocks.steep & there)
+    return Scale(noise, slip.clamp(min=LEAST_SLIP).minimum(most.slip))
+
+
+def quantile(values: Tensor, used: Tensor) -> Tensor:
+    """What a share of QUANTILE of the values (B, n) that are ``used`` does not exceed, brought to their median as of
+    noise: (B, 1)."""
+    ranked = torch.where(used, values, torch.inf).sort(1).values
+    rank = (used.sum(1, keepdim=True) * QUANTILE).long()
+    return (ranked.gather(1, rank) * TO_MEDIAN).nan_to_num(0.0, 0.0, 0.0)
+
+
+def median_fit(sums: Tensor, blocks: Blocks) -> tuple[Tensor, Tensor]:
+    """Each block's mean square (B, n) of what gain * t + offset leaves of it, and the gain (B, 1): the median of those
+    of single blocks, weighted by their contrast, as is the offset. A minority of blocks does not move them."""
+    weight, g, gg, tg = sums[:, :4].unbind(1)
+    seen, some = weight / blocks.weight.clamp(min=LEAST), weight.clamp(min=LEAST)
+    t, tt = blocks.t * seen, blocks.square * seen
+    contrast = (tt - t * t / some).clamp(min=0)
+    gain = weighted_median((tg - t * g / some) / contrast.clamp(min=LEAST), contrast * blocks.steep)
+    offset = weighted_median((g - gain * t) / some, weight)
+    left = gg - 2 * (gain * tg + offset * g) + gain * gain * tt + 2 * gain * offset * t + offset * offset * weight
+    return left.clamp(min=0) / some, gain
+
+
+def weighted_median(values: Tensor, weight: Tensor) -> Tensor:
+    """(B, n), (B, n) -> (B, 1)."""
+    ranked, order = values.sort(1)
+    share = weight.gather(1, order).cumsum(1)
+    middle = (share < share[:, -1:] / 2).sum(1, keepdim=True)
+    return ranked.gather(1, middle.clamp(max=values.shape[1] - 1))
