@@ -4,8 +4,10 @@ neither. Every file shows the same six frames, unless it says otherwise."""
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -16,7 +18,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from torch_ecc.io import open_frames
+from torch_ecc.io import FrameError, open_frames
 
 Writer: TypeAlias = Callable[[Path], object]
 
@@ -362,3 +364,69 @@ def test_phantom_frames_have_the_times_of_their_own(tmp_path):
     assert source.fps == pytest.approx(9000, rel=1e-6)
     assert [frame.time_s for frame in source] == pytest.approx([k / 9000 - 0.3 for k in range(count)], abs=1e-9)
     np.testing.assert_array_equal([frame.pixels.numpy() for frame in source], WIDE)
+
+
+# ---- damage and attacks --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["channels.tif", "slices.tif", "interval.tif", "one_page.tif"])
+def test_what_is_left_of_a_stack_that_was_cut_off_is_read(tmp_path, name):
+    """Its list of pages, which comes last, is gone, but not its first frames; channels are no time even so."""
+    kind, path = KINDS[name], tmp_path / name
+    kind.write(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 6 // 10])
+    if kind.choice:
+        with pytest.raises(ValueError, match="which are not time"):
+            open_frames(path)
+    found = []
+
+    def read_all() -> None:
+        for frame in open_frames(path, **kind.choice):
+            found.append(frame.pixels.numpy())  # noqa: PERF401, those before the error are wanted
+
+    with pytest.raises(FrameError, match="ends here, but more was promised"):
+        read_all()
+    assert 2 < len(found) < 5
+    np.testing.assert_array_equal(found, kind.levels[: len(found)])
+
+
+def claim(path: Path, side: int) -> None:
+    """A small file whose header says that its frames are so many px high and wide."""
+    if path.suffix == ".png":
+        chunks = {b"IHDR": struct.pack(">II5B", side, side, 8, 0, 0, 0, 0), b"IDAT": zlib.compress(bytes(100))}
+        framed = (struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in chunks.items())
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(framed))
+    elif path.suffix == ".npy":
+        head = f"{{'descr': '|u1', 'fortran_order': False, 'shape': (2, {side}, {side}), }}".ljust(117) + "\n"
+        path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode() + bytes(100))
+    else:
+        tifffile.imwrite(path, NARROW, photometric="minisblack", metadata=None)
+        data = path.read_bytes()
+        path.write_bytes(data.replace(struct.pack("<HHII", 256, 4, 1, 70), struct.pack("<HHII", 256, 4, 1, side)))
+
+
+@pytest.mark.parametrize("name", ["s.png", "s.npy", "s.tif"])
+def test_a_header_that_claims_too_much_is_refused_before_memory_is_asked_for(tmp_path, name):
+    claim(tmp_path / name, 10_000_000)
+    with pytest.raises(ValueError, match=r"claims 10000000 x|exceeds limit of") as caught:
+        open_frames(tmp_path / name)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if name.endswith((".tif", ".png", ".gif", ".webp"))])
+def test_no_damage_of_a_file_is_a_surprise(tmp_path, name):
+    """Whatever byte is wrong: frames, frames with a reason, or a ValueError in one line."""
+    rng, path = np.random.default_rng(len(name)), tmp_path / name
+    KINDS[name].write(path)
+    data, said = np.frombuffer(path.read_bytes(), np.uint8), []
+    for _ in range(12):
+        spoilt = data.copy()
+        spoilt[rng.integers(min(len(data), 400), size=3)] = rng.integers(256, size=3)
+        path.write_bytes(spoilt[: rng.integers(len(data) // 2, len(data) + 1)].tobytes())
+        try:
+            for frame in islice(open_frames(path, **KINDS[name].choice), 20):
+                assert (frame.pixels is None) == (frame.damage is not None)
+        except ValueError as error:
+            said.append(str(error))
+    assert all(len(each.splitlines()) == 1 for each in said)

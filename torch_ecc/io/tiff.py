@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tifffile
 from PIL import Image
 
 from torch_ecc.io.axes import Choice, Walk, walk
@@ -44,6 +43,8 @@ class _Planes(NamedTuple):
 def open_tiff(path: Path, choice: Choice) -> Medium:
     """One frame per page, or per time where the file describes its axes. ValueError if it is no TIFF, or if it has
     channels, slices or positions and none is chosen."""
+    import tifffile  # a tenth of a second, which a video need not wait for
+
     try:
         tif: Any = tifffile.TiffFile(path)
         page = tif.pages.first
