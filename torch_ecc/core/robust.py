@@ -34,7 +34,8 @@ LARGEST_SLIP = 0.5  # where all do, as of blur, nothing need cover any of them
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS = 5
-FITS = 1.6  # as ``cost`` counts: well believed by more than half, and nothing else is tried
+CLEARLY_LESS = 0.85  # of the cost of least squares: where all edges fit worse, as by blur, leaving them out gains little
+FITS = 1.4  # median excess: nothing else is tried
 BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
 SETTLED = 0.01  # of the template's weight: trust changes no more
 
@@ -96,9 +97,9 @@ def solve(
             return found
         doubted, plain = doubted.at(doubtful), each(lambda value: value[doubtful], plain)
         uneven, doubtful = uneven[doubtful], doubtful[doubtful]
-    again, left = solved_again(doubted, start, plain)
+    again, fits = solved_again(doubted, start, plain)
     # Noise may have grown in all of the patch: then least squares is right, and leaving out most of it is not.
-    again = chosen(doubtful & (uneven | (left < FITS)), again, plain._replace(trust=torch.ones_like(plain.sums[:, 0])))
+    again = chosen(doubtful & (uneven | fits), again, plain._replace(trust=torch.ones_like(plain.sums[:, 0])))
     found = found._replace(trust=torch.ones_like(found.sums[:, 0]))
     return each(lambda old, new: old.index_copy(0, doubted.which, new), found, again)
 
@@ -118,32 +119,35 @@ def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
 
 
 def solved_again(doubted: Doubted, start: Tensor, plain: Solution) -> tuple[Solution, Tensor]:
-    """The best, and its ``cost`` (n,), of what trust leads to that begins with the residuals of least squares, or with
-    those under a median fit, at the ``start`` (B, 3) or where least squares has come to; what has slid away is none."""
+    """The best, and whether it fits (n,), of what trust leads to that begins with the residuals of least squares, or
+    with those under a median fit, at the ``start`` (B, 3) or where least squares has come to, and has not slid away."""
     there = start.index_copy(0, doubted.which, plain.pose)
     here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
     first = compared(doubted, variance, seen, usual_scale(doubted, plain, plain.gain.unsqueeze(1), SLIP))
-    best, least = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain)
+    best, (least, fits) = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain)
+    least = CLEARLY_LESS * least
     for place, begin in ((there, first), (start, None), (there, None)):
         found = reweighted(doubted, place, begin or median_look(doubted, place))
-        price = cost(doubted, found)
+        price, well = cost(doubted, found)
         near = torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < BASIN
         better = (price < least) & near
-        best, least = chosen(better, found, best), torch.where(better, price, least)
-        if is_cpu(start.device) and bool((least < FITS).all()):
+        best = chosen(better, found, best)
+        least, fits = torch.where(better, price, least), torch.where(better, well, fits)
+        if is_cpu(start.device) and bool(fits.all()):
             break
-    return best, least
+    return best, fits
 
 
-def cost(doubted: Doubted, found: Solution) -> Tensor:
-    """What is left of templates (n,), in blocks at most OUTLIER times what is usual: the mean over their weight, 1 if
-    all is noise and OUTLIER if nothing fits (the truncated squares that re-weighting makes least)."""
+def cost(doubted: Doubted, found: Solution) -> tuple[Tensor, Tensor]:
+    """What is left of templates (n,) when the noise is the usual one: the mean log of the blocks' excess, which asks
+    less of what does not fit at all than of how much fits; and whether most do fit."""
     seen = found.sums[:, 0]
     scale = usual_scale(doubted, found, found.gain.unsqueeze(1), LEAST_SLIP)
-    ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(0, OUTLIER)
-    value = (ratio.nan_to_num(OUTLIER) * seen).sum(1) / seen.sum(1).clamp(min=LEAST)
-    return torch.where(found.gain > 0, value, OUTLIER)
+    ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(min=1).nan_to_num(inf, inf)
+    value = (ratio.log() * seen).sum(1) / seen.sum(1).clamp(min=LEAST)
+    fits = weighted_median(ratio, seen)[:, 0] < FITS
+    return torch.where(found.gain > 0, value, inf), fits & (found.gain > 0)
 
 
 def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:

@@ -163,10 +163,10 @@ class Recovery:
         images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
         found, score = locator.candidates(views, 0, pose)
-        if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * past.usual[r]:
+        if found.status[0] != Status.CONVERGED:
             return estimate
         index = torch.tensor([r], device=pose.device)
-        best = self.seen_in_part(views[0], found.at(index.new_zeros(1)), past.usual, index)
+        best = found.at(index.new_zeros(1))
         if not (familiar(best, past.usual[index]) & beats(best, estimate.at(index))):
             return estimate
         radius = self.reference.place.radius[r]
@@ -176,11 +176,6 @@ class Recovery:
             return estimate
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
-
-    def seen_in_part(self, view: Tensor, found: Estimate, usual: Tensor, index: Tensor) -> Estimate:
-        """Places ``found`` (n, ...) of templates at ``index`` (n,), looked at again as something may cover a part."""
-        again = solve(self.reference.select(index), view, found.pose, self.partly, None, usual[index])
-        return again._replace(origin=found.origin)
 
     def own(self, found: Estimate, before: Estimate, start: Tensor, past: Past) -> Estimate:
         """``found`` without the leaps from the ``start`` (R, 3) to where look-alikes of the templates may be as well:
