@@ -308,6 +308,21 @@ def test_a_rate_given_wins_over_the_times_of_the_file(tmp_path):
         open_frames(tmp_path / "v.mkv", fps=-1.0)
 
 
+@pytest.mark.parametrize("codec", ["mjpeg", "mpeg4", "libx264"])
+def test_frames_that_an_avi_has_dropped_leave_their_time(tmp_path, codec):
+    shown, pixel = (0, 1, 2, 27, 36, 45), "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    with av.open(str(tmp_path / "v.avi"), "w") as container:
+        stream = container.add_stream(codec, rate=30, options={"bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 70, 48, pixel
+        stream.codec_context.time_base = Fraction(1, 30)
+        for time, frame in zip(shown, NARROW, strict=True):
+            image = picture(frame, "yuv420p").reformat(format=pixel)
+            image.pts, image.time_base = time, Fraction(1, 30)
+            container.mux(stream.encode(image))
+        container.mux(stream.encode())
+    assert [frame.time_s for frame in open_frames(tmp_path / "v.avi")] == pytest.approx([t / 30 for t in shown])
+
+
 def test_a_longer_sound_is_no_missing_frame(tmp_path):
     """A container without a count of frames only tells how long the longest of its streams lasts."""
     with av.open(str(tmp_path / "v.mkv"), "w") as container:
@@ -344,26 +359,27 @@ def test_a_turned_video_is_seen_as_it_is_shown(tmp_path):
 CINE_HEAD = "<2s3HiIiI3IQ"
 
 
-def test_phantom_frames_have_the_times_of_their_own(tmp_path):
+@pytest.mark.parametrize("levels", [NARROW, WIDE], ids=["8 bits", "16 bits"])
+def test_phantom_frames_have_the_times_of_their_own(tmp_path, levels):
     """The camera ran at 90 kHz, and every tenth frame was saved: 0.3 s before the trigger."""
-    setup, blocks, count = 44 + 40, 44 + 40 + 6000, 6
+    setup, blocks, count, depth = 44 + 40, 44 + 40 + 6000, 6, levels.itemsize
     trigger = (1_700_000_000 << 32) + (1 << 31)
     times = [trigger + round((k / 9000 - 0.3) * 2**32) for k in range(count)]
     images = blocks + 8 + 8 * count + 8 * count
     head = struct.pack(CINE_HEAD, b"CI", 44, 0, 1, 0, count, 0, count, 44, setup, images - 8 * count, trigger)
-    bitmap = struct.pack("<IiiHHIIiiII", 40, 70, 48, 1, 16, 0, 2 * 70 * 48, 0, 0, 0, 0)
+    bitmap = struct.pack("<IiiHHIIiiII", 40, 70, 48, 1, 8 * depth, 0, depth * 70 * 48, 0, 0, 0, 0)
     told = bytearray(6000)
     struct.pack_into("<H", told, 0, 9000)
     struct.pack_into("<2sH", told, 140, b"ST", 6000)
     block = struct.pack(f"<IHH{count}Q", 8 + 8 * count, 1002, 0, *times)
-    size = 8 + 2 * 70 * 48
+    size = 8 + depth * 70 * 48
     offsets = struct.pack(f"<{count}Q", *(images + k * size for k in range(count)))
-    frames = b"".join(struct.pack("<II", 8, 2 * 70 * 48) + frame[::-1].tobytes() for frame in WIDE)
+    frames = b"".join(struct.pack("<II", 8, depth * 70 * 48) + frame[::-1].tobytes() for frame in levels)
     (tmp_path / "v.cine").write_bytes(head + bitmap + told + block + offsets + frames)
     source = open_frames(tmp_path / "v.cine")
     assert source.fps == pytest.approx(9000, rel=1e-6)
     assert [frame.time_s for frame in source] == pytest.approx([k / 9000 - 0.3 for k in range(count)], abs=1e-9)
-    np.testing.assert_array_equal([frame.pixels.numpy() for frame in source], WIDE)
+    np.testing.assert_array_equal([frame.pixels.numpy() for frame in source], levels)
 
 
 # ---- damage and attacks --------------------------------------------------------------------------------------------
