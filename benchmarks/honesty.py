@@ -44,13 +44,14 @@ class Run(NamedTuple):
     status: Tensor
     score: Tensor
     origin: Tensor
+    coverage: Tensor
     seconds: Tensor
 
     @staticmethod
     def of(film: Film, told: Estimate, seconds: Tensor) -> Run:
         """What a tracker ``told`` of the frames of a film, (F, R, ...)."""
-        error = in_degrees(told.pose - film.truth)
-        return Run(film, error, in_degrees(told.sigma), told.status, told.score, told.origin, seconds)
+        error, sigma = in_degrees(told.pose - film.truth), in_degrees(told.sigma)
+        return Run(film, error, sigma, told.status, told.score, told.origin, told.coverage, seconds)
 
     @property
     def believed(self) -> Tensor:
@@ -111,7 +112,8 @@ def follow_peer(film: Film, start: Start) -> Run:
         status.append(Status.CONVERGED if found else Status.LOST)
     error = in_degrees(torch.tensor(poses, dtype=torch.float64)[:, None] - film.truth)
     none, nothing = torch.full_like(error, math.nan), torch.zeros_like(error[..., 0])
-    return Run(film, error, none, torch.tensor(status)[:, None], nothing, nothing.to(torch.int8), torch.tensor(seconds))
+    origin, codes = nothing.to(torch.int8), torch.tensor(status)[:, None]
+    return Run(film, error, none, codes, nothing, origin, none[..., 0], torch.tensor(seconds))
 
 
 def recovery(run: Run) -> float:
@@ -142,7 +144,8 @@ def worst(runs: Sequence[Run], count: int) -> list[tuple[str, ...]]:
             error, sigma = run.error[k, r].tolist(), run.sigma[k, r].tolist()
             most = max(abs(e) / s for e, s in zip(error, sigma, strict=True)) if min(sigma) > 0 else math.inf
             told = f"{float(run.score[k, r]):.3f}", Origin(int(run.origin[k, r])).name
-            place = f"film {number}, frame {k + 1}, patch {r}", f"{float(run.film.seen[k, r]):.2f}"
+            seen = f"{float(run.film.seen[k, r]):.2f} {float(run.coverage[k, r]):.2f}"
+            place = f"film {number}, frame {k + 1}, patch {r}", seen
             found.append((most, (*place, _triple(error), _triple(sigma), *told)))
     return [cells for _, cells in sorted(found, reverse=True)[:count]]
 
@@ -161,6 +164,7 @@ def figures(runs: Sequence[Run]) -> dict[str, float]:
     believed, off, wrong = (joined(runs, part) for part in (lambda r: r.believed, lambda r: r.off, lambda r: r.wrong))
     error, sigma, status = (joined(runs, part) for part in (lambda r: r.error, lambda r: r.sigma, lambda r: r.status))
     bound, seen = joined(runs, lambda r: in_degrees(r.film.bound)), joined(runs, lambda r: r.film.seen)
+    coverage = joined(runs, lambda r: r.coverage)[believed] - seen[believed]
     far = torch.hypot(error[:, 0], error[:, 1]) > FAR
     visible = seen >= VISIBLE
     times = 1e3 * torch.cat([run.seconds for run in runs])
@@ -181,12 +185,13 @@ def figures(runs: Sequence[Run]) -> dict[str, float]:
         "recovery": max(back, default=math.nan),
         "bound": root_mean_square((error / bound)[fair]),
         "sigma": root_mean_square((error / sigma)[believed]),
+        "coverage": float(coverage.square().mean().sqrt()),
         "median": float(times.median()),
         "longest": float(times.max()),
     }
 
 
-UNITS = {"bound": "x", "sigma": "x", "median": "ms", "longest": "ms", "recovery": "frames"}
+UNITS = {"bound": "x", "sigma": "x", "median": "ms", "longest": "ms", "recovery": "frames", "coverage": ""}
 BETTER = {"converged": "higher", "right": "higher"}
 TOLERANCE = {"wrong": 0.0, "after": 0.0, "far": 0.0, "right": 0.02, "lost": 0.0, "bound": 0.1, "sigma": 0.1}
 

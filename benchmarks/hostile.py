@@ -17,6 +17,8 @@ and of the worst of x, y, theta:
 
 bound        rms error of what is CONVERGED and not wrong over the Cramer-Rao bound of what is to be seen
 sigma        rms of error over sigma of all that is CONVERGED
+
+coverage     rms of coverage minus the share that is to be seen
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Container, Iterable, Iterator
+from contextlib import suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -47,7 +50,7 @@ SHARES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 ARRAYS = 25  # of each kind
 PEER = "OpenCV ECC, fastest fair"
 COUNTS = ("frames", "converged", "right", "off", "wrong", "far", "after", "disbelieved", "lost")
-RATIOS = {"recovery": ".0f", "bound": ".2f", "sigma": ".2f", "median": ".2f", "longest": ".0f"}
+RATIOS = {"recovery": ".0f", "bound": ".2f", "sigma": ".2f", "coverage": ".2f", "median": ".2f", "longest": ".0f"}
 console = Console(width=190)
 
 Row = Callable[[Shot], Film]
@@ -173,7 +176,7 @@ def show(found: dict[str, dict[str, float]]) -> None:
 
 def show_worst(runs: Runs, count: int) -> None:
     """The worst frames of every row that are wrong and believed."""
-    header = ("row", "where", "seen", "error px px deg", "sigma", "score", "origin")
+    header = ("row", "where", "seen, coverage", "error px px deg", "sigma", "score", "origin")
     table = Table(*header, box=None, pad_edge=False)
     for title, some in runs.items():
         for cells in worst(some, count):
@@ -225,8 +228,9 @@ def main(
     families = list(SCENES)[:2] if quick else list(SCENES)
     runs: Runs = {}
     films = chain(filmed(rows, wanted, shots(scenes, families)), made(own, wanted))
-    for name, film in track(films, "films", console=Console(stderr=True), transient=True):
-        followed(runs, name, film, by)
+    with suppress(KeyboardInterrupt):  # what there is by then is shown
+        for name, film in track(films, "films", console=Console(stderr=True), transient=True):
+            followed(runs, name, film, by)
     more, growth = soaked(soak_frames, by) if "soak" in wanted else ({}, [])
     runs |= more
     found = {title: figures(some) for title, some in runs.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 
 import pytest
 import torch
@@ -42,13 +43,14 @@ def write_track(folder, micrometres: bool = True, fps: float | None = 100.0, los
             status = torch.tensor([0, 2 if k in lost else 0], dtype=torch.int8)
             flat = torch.ones(2)
             covariance = 1e-6 * torch.eye(3).double().expand(2, 3, 3)
-            writer.write(Estimate(moved + 300.0, moved, flat, status, flat.int(), covariance, flat, 0 * status))
+            fields = {"pose": moved + 300.0, "displacement": moved, "status": status, "covariance": covariance}
+            writer.write(Estimate(**{name: fields.get(name, flat) for name in Estimate._fields}))
     return str(folder / "track.csv")
 
 
-def write_sensors(path, header="time_s,x_um,y_um,theta_urad", angle: float = 1e6, gap: range = range(0)) -> str:
-    t = torch.arange(0, 3.5, 1 / 1024).double()
-    rows = torch.cat((t[:, None], motion(t) * torch.tensor([1, 1, angle])), 1).tolist()
+def write_sensors(path, sense: tuple[int, int, int] = (1, 1, 1), gap: range = range(0)) -> str:
+    t, header = torch.arange(0, 3.5, 1 / 1024).double(), "time_s,x_um,y_um,theta_urad"
+    rows = torch.cat((t[:, None], motion(t) * torch.tensor([1, 1, 1e6]) * torch.tensor(sense)), 1).tolist()
     lines = [",".join(f"{v:.9g}" for v in row) for k, row in enumerate(rows) if k not in gap]
     path.write_text("\n".join((header, *lines)) + "\n")
     return str(path)
@@ -122,28 +124,86 @@ def test_what_is_estimated_is_up_to_the_user(tmp_path):
     assert abs(found["lever_x_um"]["value"]) < 4 * found["lever_x_um"]["sigma"]
 
 
-def test_opposite_angles_are_reported(tmp_path):
-    track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv", angle=-1e6)
-    assert "theta runs in opposite directions" in run(track, sensors, "--template", 1, "--out", tmp_path / "o").output
-    done = run(track, sensors, "--template", 1, "--flip-theta", "--out", tmp_path / "o")
-    assert "opposite directions" not in done.output
+SENSES = {
+    "+++": (1, 1, 1),
+    "++-": (1, 1, -1),
+    "+-+": (1, -1, 1),  # y upwards, theta from x to y
+    "+--": (1, -1, -1),
+    "-++": (-1, 1, 1),
+}
+
+
+@pytest.mark.parametrize("signs", SENSES)
+def test_axes_that_count_the_other_way_are_found_and_said(signs, tmp_path):
+    turned = SENSES[signs]
+    track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv", sense=turned)
+    done = run(track, sensors, "--template", 1, "--out", tmp_path / "o")
+    assert (f"--signs {signs}" in done.output) == (signs != "+++"), done.output
     figures = json.loads((tmp_path / "o" / "comparison.json").read_text())
-    assert figures["errors"]["estimated_at_once"]["theta_urad"]["rms"] == pytest.approx(NOISE_NM, rel=0.1)
+    assert tuple(figures["signs"].values()) == turned
+    offset = figures["estimated"]["offset_s"]
+    assert abs(offset["value"] - OFFSET) < 4 * offset["sigma"] < 1e-3
+    for name in ("x_nm", "y_nm", "theta_urad"):
+        assert figures["errors"]["estimated_at_once"][name]["rms"] == pytest.approx(NOISE_NM, rel=0.1)
+    told = run(track, sensors, "--template", 1, "--signs", signs, "--fixed-angle", "--out", tmp_path / "told")
+    assert told.exit_code == 0
+    again = json.loads((tmp_path / "told" / "comparison.json").read_text())
+    assert again["signs"] == figures["signs"]
+
+
+def test_a_log_without_theta_on_another_clock(tmp_path):
+    """In ms since 1970, with a decimal comma; what is not there is asked of nothing, and nothing is glued together."""
+    t = torch.arange(0, 3.5, 1 / 1024).double()
+    rows = zip((1000 * t + 1.7e12).tolist(), *(1e3 * motion(t)[:, :2]).T.tolist(), strict=True)
+    lines = (";".join(f"{value:.4f}" for value in row).replace(".", ",") for row in rows)
+    (tmp_path / "stage.csv").write_text("\n".join(("Stamp;X [nm];Y [nm]", *lines)))
+    options = ("--columns", "time=Stamp:ms", "--template", 1)
+    done = run(write_track(tmp_path), tmp_path / "stage.csv", *options, "--out", tmp_path / "o")
+    assert done.exit_code == 0, done.output
+    figures = json.loads((tmp_path / "o" / "comparison.json").read_text())
+    offset = figures["estimated"]["offset_s"]
+    assert abs(offset["value"] - 1.7e9 - OFFSET) < 4 * offset["sigma"] < 1e-3
+    assert set(figures["errors"]["estimated_at_once"]) == {"x_nm", "y_nm"}
+    assert "theta0_rad" not in figures["estimated"]
+    table = [line for line in done.output.splitlines() if line.startswith(("error", "estimated", "nearest"))]
+    assert len({len(line) for line in table}) == 1
+    assert all(len(re.split(r"\s{3,}", line)) == 3 for line in table)
+    with (tmp_path / "o" / "errors.csv").open() as file:
+        assert {row["dtheta_urad"] for row in csv.DictReader(file)} == {""}
+
+
+def test_units_that_are_wrong_are_pointed_at(tmp_path):
+    track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv")
+    done = run(track, sensors, "--template", 1, "--columns", "x=x_um:mm, y=y_um:mm", "--out", tmp_path / "o")
+    assert "times as far as the track: are the units and um_per_px right?" in done.output
+
+
+def test_what_did_not_converge_is_exit_2(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch_ecc.records.least_squares.SETTLED", -1.0)
+    done = run(write_track(tmp_path), write_sensors(tmp_path / "cds.csv"), "--template", 1, "--out", tmp_path / "o")
+    assert done.exit_code == 2
+    assert "still moving when its iterations ran out" in done.output
+    assert (tmp_path / "o" / "comparison.png").is_file()
 
 
 HEAD = "time_s,x_um,y_um,theta_urad\n"
 BAD_SENSORS = {
-    "columns": ("t,x,y,theta_urad\n0,1,2,3\n", "column time_s is missing; columns found: t, x, y, theta_urad"),
-    "semicolons": ("time_s;x_um\n1;2\n", "columns found: time_s;x_um"),
-    "no angle": ("time_s,x_um,y_um\n0,1,2\n", "expected one column of theta_rad, theta_urad, theta_deg"),
+    "no unit": ("t,x,y,theta_urad\n0,1,2,3\n", "column x has no unit: expected um, "),
+    "other unit": ("time_s,x [V],y_um\n0,1,2\n", "column x [V] is in 'V': expected um, "),
+    "columns": (
+        "A,B,C\n0,1,2\n",
+        "no column of times found, see --columns 'time=NAME' and --sensors-hz; columns found: A, B, C",
+    ),
+    "only times": ("time_s,A\n0,1\n", "no column of x, y or theta found"),
+    "two angles": (HEAD.strip() + ",theta_deg\n0,1,2,3,4\n", "theta may be any of theta_urad, theta_deg: choose one"),
     "word": (HEAD + "0,1,2,3\n1,one,2,3\n", "line 3, column x_um: expected a number, got 'one'"),
-    "unsorted": (HEAD + "0,1,2,3\n2,1,2,3\n1,1,2,3\n", "line 4: time_s must increase, 1 follows 2"),
+    "unsorted": (HEAD + "0,1,2,3\n2,1,2,3\n1,1,2,3\n", "line 4: times must increase, 1 follows 2"),
     "no time": (HEAD + "0,1,2,3\n,1,2,3\n", "line 3: time_s must be a finite number"),
     "short row": (HEAD + "0,1,2,3\n1,1,2\n", "line 3 must have 4 cells, got 3"),
-    "header only": (HEAD, "expected a header and rows of numbers, got 4 columns without a row"),
-    "empty": ("", "expected a header and rows of numbers, got 0 columns"),
+    "header only": (HEAD, "expected a header and rows of numbers, found no two columns of numbers"),
+    "empty": ("", "expected a header and rows of numbers, found no two columns of numbers"),
+    "binary": ("\x00\x01\x02\n\x03", "expected a header and rows of numbers"),
     "no poses": (HEAD + "0,,,\n1,,,\n2,,,\n3,,,\n", "sensors: expected at least 4 samples with a finite pose, got 0"),
-    "apart": (HEAD + "".join(f"{1000 + k},{k},2,3\n" for k in range(9)), "the records do not overlap"),
 }
 
 
@@ -167,6 +227,9 @@ def test_bad_jobs(tmp_path):
         "fps: expected a rate > 0 in Hz, got 0": {"track": track, "fps": 0.0},
         "um_per_px: expected one or two finite numbers": {"track": track, "um_per_px": 0.0},
         "max_offset_s: expected a time >= 0": {"track": track, "max_offset_s": -1.0},
+        "sensors_hz: expected a rate > 0 in Hz, got -1": {"track": track, "sensors_hz": -1.0},
+        "signs: expected one of auto, ": {"track": track, "signs": "up"},
+        "the records do not overlap, see max_offset_s": {"track": track, "fps": 1e-3, "max_offset_s": 0.001},
         "compare: out_dir must be a folder": {"track": track, "out": sensors},
         "column template is missing": {"track": sensors},
     }

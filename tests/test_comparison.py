@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from torch_ecc.core.pose import rotation
 from torch_ecc.records.curves import fit_circle, fit_ellipse, fit_line
 from torch_ecc.records.motion import Motion, check_motion, dwell_errors, nearest_errors
-from torch_ecc.records.synchrony import Curve, Unknowns, align_records, noise, spline_slopes
+from torch_ecc.records.spline import Curve, spline_slopes
+from torch_ecc.records.synchrony import Unknowns, align_records, noise
+from torch_ecc.records.whitening import autoregression, whiten
 
 OFFSET, ANGLE, LEVER = 0.337, 0.01, (800.0, -500.0)
 NEAR = Unknowns(max_offset_s=0.4)
@@ -30,10 +32,10 @@ def truth(t: torch.Tensor, turn: float = 0.0) -> torch.Tensor:
     return torch.stack((12 * out * phase.cos(), 11.5 * out * phase.sin(), turn * out), -1)
 
 
-def records(nm: float = 0.0, seed: int = 0, turn: float = 0.0, lever: tuple[float, float] = (0.0, 0.0)):
+def records(nm: float = 0.0, seed: int = 0, turn: float = 0.0, lever: tuple[float, float] = (0.0, 0.0), late=0.0):
     """A track at 100 Hz of what sensors see at 1024 Hz, on another clock, along other axes, from other zeros."""
     t, s = torch.arange(0, 4.5, 0.01).double(), torch.arange(0, 5, 1 / 1024).double()
-    m = truth(t + OFFSET, turn)
+    m = truth(t + OFFSET + late, turn)
     m[:, :2] += (rotation(m[:, 2]) - torch.eye(2)) @ torch.tensor(lever).double() - torch.tensor([3.0, -2.0])
     m[:, :2] = m[:, :2] @ rotation(torch.tensor(ANGLE).double())
     scatter = torch.randn(m.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -60,6 +62,153 @@ def test_the_scatter_agrees_with_the_covariance():
     assert ((ratio > 0.65) & (ratio < 1.4)).all(), ratio
     rms = torch.stack([f.rms for f in found]).mean(0)
     assert torch.allclose(rms, torch.tensor([5e-3, 5e-3, 5e-6]).double(), rtol=0.05)
+
+
+def coloured(count: int, g: torch.Generator, keep: float = 0.85) -> torch.Tensor:
+    """Errors of 10 nm and urad that cling together over several frames."""
+    scatter = torch.randn(count, 3, generator=g, dtype=torch.float64)
+    for k in range(1, count):
+        scatter[k] = keep * scatter[k - 1] + math.sqrt(1 - keep**2) * scatter[k]
+    return 10 * scatter
+
+
+def disturbed(kind: str, seed: int) -> tuple[Motion, Motion]:
+    """The records with one more thing that real ones have."""
+    g = torch.Generator().manual_seed(seed)
+    track, sensors = records(5.0, seed, turn=2e-3)
+    unit, t, s = torch.tensor([1e-3, 1e-3, 1e-6]).double(), track.time_s, sensors.time_s
+    random = lambda *size: torch.randn(*size, generator=g, dtype=torch.float64)  # noqa: E731
+    if kind == "clinging":
+        track.pose.add_(unit * coloured(len(t), g))
+    elif kind == "drifting":
+        track.pose.add_(unit * 100 * random(3) * (t[:, None] / t[-1] - 0.5))
+    elif kind == "shaking":
+        track.pose.add_(unit * 20 * (math.tau * 17.3 * t[:, None] + 6 * random(3)).sin())
+    elif kind == "uneven":
+        times = s + 0.3 / 1024 * (2 * torch.rand(len(s), generator=g).double() - 1)
+        sensors = Motion(times, truth(times + 2e-4 * random(len(s)), 2e-3))
+    elif kind == "quantised":
+        sensors = Motion(s, (sensors.pose / (30 * unit)).round() * 30 * unit)
+    elif kind == "jittering":
+        late = 1e-3 * random(len(t))
+        track = Motion(t, track.pose + (records(0.0, turn=2e-3, late=late)[0].pose - records(turn=2e-3)[0].pose))
+    elif kind == "broken":
+        track.pose[60:110] = math.nan
+        keep = (s < 2.0) | (s > 2.3)
+        sensors = Motion(s[keep], sensors.pose[keep])
+    return track, sensors
+
+
+@pytest.mark.parametrize("kind", ["clinging", "drifting", "shaking", "uneven", "quantised", "jittering", "broken"])
+def test_sigma_is_honest_whatever_the_errors_are(kind):
+    """The plain covariance of independent errors is too small by 3 and more where they cling, drift or jitter."""
+    found = [align_records(*disturbed(kind, seed), NEAR) for seed in range(16)]
+    assert all(f.converged for f in found)
+    pulls = torch.tensor(
+        [
+            [(f.offset_s - OFFSET) / f.sigma["offset_s"], (f.axis_angle - ANGLE) / f.sigma["axis_angle_rad"]]
+            for f in found
+        ]
+    )
+    ratio = pulls.square().mean(0).sqrt()
+    assert ((ratio > 0.5) & (ratio < 1.75)).all(), ratio
+
+
+def test_a_drift_does_not_move_the_clock():
+    """Of a drift of 1 um in 4.5 s next to nothing gets into the offset: 0.5 ms do if errors count as independent."""
+    track, sensors = records(1.0)
+    track.pose.add_(torch.tensor([1.0, -0.7, 3e-4]).double() * track.time_s[:, None] / 4.5)
+    assert abs(align_records(track, sensors, NEAR).offset_s - OFFSET) < 1e-4
+
+
+@pytest.mark.parametrize("apart", [0.0, 25.0, -1500.0, 5e7, 1.7e9])
+def test_clocks_may_be_any_time_apart(apart):
+    """Also a short track anywhere in a long record; hours, years."""
+    track, sensors = records(5.0)
+    found = align_records(Motion(track.time_s - apart, track.pose), sensors)
+    assert found.offset_s - apart == pytest.approx(OFFSET, abs=1e-4)
+    assert found.rival_s is None
+
+
+@pytest.mark.parametrize("signs", [(1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, 1)])
+@pytest.mark.parametrize("turn", [0.0, 1.5, -1.2])
+def test_the_sense_of_the_axes_is_found(signs, turn):
+    """Also with x and y exchanged; a lever arm turns as the stage does in the image, not as its sensors count."""
+    track, sensors = records(5.0, turn=0.004)
+    pose, lever = track.pose.clone(), torch.tensor(LEVER).double()
+    angle = math.prod(signs) * truth(track.time_s + OFFSET, 0.004)[:, 2]
+    arm = (rotation(angle) - torch.eye(2)) @ lever
+    pose[:, :2] += arm @ rotation(torch.tensor(ANGLE).double())
+    pose[:, :2] = pose[:, :2] @ rotation(torch.tensor(turn).double())
+    pose = pose * torch.tensor(signs).double()
+    found = align_records(Motion(track.time_s, pose), sensors, Unknowns(signs=None, lever=True, max_offset_s=0.4))
+    assert math.prod(found.signs.tolist()) == math.prod(signs)
+    assert found.signs[2] == signs[2]
+    assert abs(found.offset_s - OFFSET) < 5 * found.sigma["offset_s"] < 1e-3
+    assert (
+        (found.lever - lever).abs() < 5 * torch.tensor([found.sigma["lever_x_um"], found.sigma["lever_y_um"]])
+    ).all()
+    assert torch.allclose(found.rms, 5 * torch.tensor([1e-3, 1e-3, 1e-6]).double(), rtol=0.1)
+
+
+@pytest.mark.parametrize("missing", [(2,), (0, 2), (1, 2), (0, 1)])
+def test_components_that_the_sensors_do_not_have(missing):
+    """Nothing is asked of them, and the rest is as good as it can be."""
+    track, sensors = records(5.0, turn=0.004)
+    pose, plane = track.pose.clone(), len(missing) == 1
+    if not plane:  # then the axis angle is taken as given
+        pose[:, :2] = pose[:, :2] @ rotation(torch.tensor(-ANGLE).double())
+    sensors.pose[:, list(missing)] = math.nan
+    found = align_records(Motion(track.time_s, pose), sensors, NEAR)
+    there = [k for k in range(3) if k not in missing]
+    assert found.errors[found.valid][:, missing].isnan().all()
+    assert torch.allclose(found.rms[there], (5 * torch.tensor([1e-3, 1e-3, 1e-6]).double())[there], rtol=0.1)
+    assert abs(found.offset_s - OFFSET) < 5 * found.sigma["offset_s"]
+    assert ("axis_angle_rad" in found.names) == plane
+
+
+def test_a_motion_that_repeats_itself_has_rivals():
+    """And the offset nearest to clocks that agree is taken."""
+    t, s = torch.arange(0, 5, 0.01).double(), torch.arange(-10, 20, 1 / 1024).double()
+    wave = lambda u: torch.stack(((math.tau * u).sin(), (math.tau * u).cos(), 1e-4 * (math.tau * u).sin()), -1)  # noqa: E731
+    scatter = 5e-3 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0)).double()
+    scatter[:, 2] *= 1e-3
+    found = align_records(Motion(t, wave(t + 0.2) + scatter), Motion(s, wave(s)), Unknowns(angle=False))
+    assert math.remainder(found.offset_s - 0.2, 1.0) == pytest.approx(0, abs=1e-3)
+    assert abs(found.offset_s) < 2
+    assert found.rival_s is not None
+    assert math.remainder(found.rival_s - found.offset_s, 1.0) == pytest.approx(0, abs=1e-3)
+
+
+def test_a_clock_that_is_faster():
+    track, sensors = records(5.0)
+    middle = float(track.time_s[-1]) / 2
+    fast = Motion(middle + (track.time_s - middle) * (1 - 300e-6), track.pose)
+    found = align_records(fast, sensors, Unknowns(rate=True, max_offset_s=0.4))
+    assert abs(found.rate_ppm - 300) < 4 * found.sigma["rate_ppm"] < 200
+    assert torch.allclose(found.at(fast.time_s) - OFFSET, track.time_s, atol=1e-4)
+
+
+def test_samples_at_the_same_time_are_one():
+    """Clocks that tick more slowly than the samples come, and rows that stand twice."""
+    track, sensors = records(5.0)
+    twice = Motion(sensors.time_s.repeat_interleave(2), sensors.pose.repeat_interleave(2, 0))
+    found = align_records(track, twice, NEAR)
+    assert found.offset_s == pytest.approx(align_records(track, sensors, NEAR).offset_s, abs=1e-9)
+
+
+def test_autoregression_and_its_filter():
+    """Burg's recursion finds what a series was made with, whitening gives back what it was made from."""
+    g = torch.Generator().manual_seed(0)
+    innovations = torch.randn(5000, generator=g, dtype=torch.float64)
+    series = innovations.clone()
+    for k in range(2, 5000):
+        series[k] += 1.2 * series[k - 1] - 0.5 * series[k - 2]
+    a = autoregression(series)
+    exact = torch.tensor([1.2, -0.5], dtype=torch.float64)
+    assert torch.allclose(a[:2], exact, atol=0.05)
+    assert torch.allclose(whiten(series, exact, 4), innovations[4:], atol=1e-9)
+    assert len(autoregression(innovations)) <= 1
 
 
 @example(0.0390625, 0.3550873852102767, 0.0)  # a step that was small by chance before the weights had settled
@@ -147,7 +296,8 @@ def test_exposure_is_averaged_over():
     """Of a 20 Hz sine, an exposure T leaves sinc(f T)."""
     t, s = torch.arange(0.1, 4, 0.01).double(), torch.arange(0, 5, 1 / 4096).double()
     wave = lambda u: torch.stack(((20 * math.tau * u).sin(), 0 * u, 0 * u), -1)  # noqa: E731
-    value, speed, inside = Curve(Motion(s, wave(s)), 0.008)(t)
+    curve = Curve(Motion(s, wave(s)), 0.008)
+    (value, inside), speed = curve(t), curve.speed(t)
     expected = math.sin(math.pi * 0.16) / (math.pi * 0.16)
     assert inside.all()
     assert torch.allclose(value, expected * wave(t), atol=2e-3)
@@ -207,7 +357,7 @@ def test_bad_records(motion, message):
 def test_records_apart():
     track, sensors = records()
     with pytest.raises(ValueError, match="align: the records do not overlap, see max_offset_s"):
-        align_records(Motion(track.time_s + 100, track.pose), sensors)
+        align_records(Motion(track.time_s + 100, track.pose), sensors, Unknowns(max_offset_s=2.0))
 
 
 @pytest.mark.parametrize("name", ["exposure_s", "max_offset_s"])

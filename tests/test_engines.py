@@ -71,7 +71,7 @@ def drawn(seed: int) -> tuple[Problem, Settings]:
 def trusted(reference: Reference, seed: int) -> Tensor:
     """Trust (B, blocks) in each block of templates: whole, none, or anything between."""
     draw = torch.Generator().manual_seed(seed)
-    value = torch.rand(reference.blocks.count.shape, generator=draw)
+    value = torch.rand(reference.blocks.weight.shape, generator=draw)
     return (3 * value - 0.5).clamp(0, 1)
 
 

@@ -91,7 +91,7 @@ def test_counts(shot: Shot) -> None:
     error[:, 0, 0] = torch.tensor([0.05, 0.2, 0.2, 3.0, 0.01, 9.0])
     sigma[1] = 0.1
     status = torch.tensor([0, 0, 0, 0, Status.MAX_ITERATIONS, Status.LOST], dtype=torch.int8)[:, None]
-    found = honesty.figures([honesty.Run(film, error, sigma, status, status, status, torch.ones(n))])
+    found = honesty.figures([honesty.Run(film, error, sigma, status, status, status, status, torch.ones(n))])
     counts = {"converged": 4, "right": 1, "off": 3, "wrong": 2, "far": 1, "after": 2, "disbelieved": 1, "lost": 1}
     assert {name: found[name] for name in counts} == counts
     assert found["recovery"] == math.inf

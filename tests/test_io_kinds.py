@@ -3,8 +3,11 @@ neither. Every file shows the same six frames, unless it says otherwise."""
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -15,7 +18,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from torch_ecc.io import open_frames
+from torch_ecc.io import FrameError, open_frames
 
 Writer: TypeAlias = Callable[[Path], object]
 
@@ -261,6 +264,7 @@ def test_a_folder_named_by_digits_is_a_folder(tmp_path, monkeypatch):
     [
         ("t_0s.png", "t_0.5s.png", "t_1s.png", "t_1.5s.png", "t_10s.png"),
         ("2024.5.1.png", "2024.5.2.png", "2024.5.10.png", "2024.10.1.png"),
+        ("cam1.8.png", "cam1.9.png", "cam1.10.png", "cam1.11.png"),
         ("a2.png", "A10.png", "b1.png"),
         ("x²1.png", "x²2.png", "x²10.png"),
     ],
@@ -270,6 +274,14 @@ def test_files_are_read_in_the_order_of_their_numbers(tmp_path, names):
     assert source.named
     assert [frame.name for frame in source] == list(names)
     np.testing.assert_array_equal([frame.pixels.numpy() for frame in source], WIDE[: len(names)])
+
+
+def test_the_content_says_what_an_image_is_and_not_its_name(tmp_path):
+    """16 bits of a PNG that is called .jpg are no JPEG's eight."""
+    folder(tmp_path / "f", "f0.png", "f1.png")
+    for name in ("f0", "f1"):
+        (tmp_path / "f" / f"{name}.png").rename(tmp_path / "f" / f"{name}.jpg")
+    np.testing.assert_array_equal([frame.pixels.numpy() for frame in open_frames(tmp_path / "f")], WIDE[:2])
 
 
 @pytest.mark.parametrize(
@@ -294,3 +306,143 @@ def test_a_rate_given_wins_over_the_times_of_the_file(tmp_path):
     assert [frame.time_s for frame in source] == pytest.approx([k / 100 for k in range(6)])
     with pytest.raises(ValueError, match="fps must be a rate > 0 in Hz, got -1"):
         open_frames(tmp_path / "v.mkv", fps=-1.0)
+
+
+@pytest.mark.parametrize("codec", ["mjpeg", "mpeg4", "libx264"])
+def test_frames_that_an_avi_has_dropped_leave_their_time(tmp_path, codec):
+    shown, pixel = (0, 1, 2, 27, 36, 45), "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    with av.open(str(tmp_path / "v.avi"), "w") as container:
+        stream = container.add_stream(codec, rate=30, options={"bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 70, 48, pixel
+        stream.codec_context.time_base = Fraction(1, 30)
+        for time, frame in zip(shown, NARROW, strict=True):
+            image = picture(frame, "yuv420p").reformat(format=pixel)
+            image.pts, image.time_base = time, Fraction(1, 30)
+            container.mux(stream.encode(image))
+        container.mux(stream.encode())
+    assert [frame.time_s for frame in open_frames(tmp_path / "v.avi")] == pytest.approx([t / 30 for t in shown])
+
+
+def test_a_longer_sound_is_no_missing_frame(tmp_path):
+    """A container without a count of frames only tells how long the longest of its streams lasts."""
+    with av.open(str(tmp_path / "v.mkv"), "w") as container:
+        picture_stream, sound = container.add_stream("ffv1", rate=20), container.add_stream("pcm_s16le", rate=8000)
+        picture_stream.width, picture_stream.height, picture_stream.pix_fmt = 70, 48, "gray"
+        for frame in NARROW:
+            container.mux(picture_stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+        container.mux(picture_stream.encode())
+        for k in range(5):
+            silence = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
+            silence.sample_rate, silence.pts, silence.time_base = 8000, 8000 * k, Fraction(1, 8000)
+            container.mux(sound.encode(silence))
+        container.mux(sound.encode())
+    np.testing.assert_array_equal([frame.pixels.numpy() for frame in open_frames(tmp_path / "v.mkv")], NARROW)
+
+
+def test_a_turned_video_is_seen_as_it_is_shown(tmp_path):
+    with av.open(str(tmp_path / "v.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=20, options={"crf": "1"})
+        if not hasattr(stream, "set_display_rotation"):
+            pytest.skip("this PyAV writes no rotation")
+        stream.width, stream.height, stream.pix_fmt = 70, 48, "yuv420p"
+        stream.set_display_rotation(90)  # counter-clockwise
+        for frame in NARROW:
+            container.mux(stream.encode(picture(frame, "yuv420p")))
+        container.mux(stream.encode())
+    source = open_frames(tmp_path / "v.mp4")
+    assert source.shape == (70, 48)
+    for frame, stored in zip(source, NARROW, strict=True):
+        assert np.abs(np.rot90(stored).astype(int) - frame.pixels.numpy()).max() <= 4
+        assert frame.picture().shape == (3, 70, 48)
+
+
+CINE_HEAD = "<2s3HiIiI3IQ"
+
+
+@pytest.mark.parametrize("levels", [NARROW, WIDE], ids=["8 bits", "16 bits"])
+def test_phantom_frames_have_the_times_of_their_own(tmp_path, levels):
+    """The camera ran at 90 kHz, and every tenth frame was saved: 0.3 s before the trigger."""
+    setup, blocks, count, depth = 44 + 40, 44 + 40 + 6000, 6, levels.itemsize
+    trigger = (1_700_000_000 << 32) + (1 << 31)
+    times = [trigger + round((k / 9000 - 0.3) * 2**32) for k in range(count)]
+    images = blocks + 8 + 8 * count + 8 * count
+    head = struct.pack(CINE_HEAD, b"CI", 44, 0, 1, 0, count, 0, count, 44, setup, images - 8 * count, trigger)
+    bitmap = struct.pack("<IiiHHIIiiII", 40, 70, 48, 1, 8 * depth, 0, depth * 70 * 48, 0, 0, 0, 0)
+    told = bytearray(6000)
+    struct.pack_into("<H", told, 0, 9000)
+    struct.pack_into("<2sH", told, 140, b"ST", 6000)
+    block = struct.pack(f"<IHH{count}Q", 8 + 8 * count, 1002, 0, *times)
+    size = 8 + depth * 70 * 48
+    offsets = struct.pack(f"<{count}Q", *(images + k * size for k in range(count)))
+    frames = b"".join(struct.pack("<II", 8, depth * 70 * 48) + frame[::-1].tobytes() for frame in levels)
+    (tmp_path / "v.cine").write_bytes(head + bitmap + told + block + offsets + frames)
+    source = open_frames(tmp_path / "v.cine")
+    assert source.fps == pytest.approx(9000, rel=1e-6)
+    assert [frame.time_s for frame in source] == pytest.approx([k / 9000 - 0.3 for k in range(count)], abs=1e-9)
+    np.testing.assert_array_equal([frame.pixels.numpy() for frame in source], levels)
+
+
+# ---- damage and attacks --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["channels.tif", "slices.tif", "interval.tif", "one_page.tif"])
+def test_what_is_left_of_a_stack_that_was_cut_off_is_read(tmp_path, name):
+    """Its list of pages, which comes last, is gone, but not its first frames; channels are no time even so."""
+    kind, path = KINDS[name], tmp_path / name
+    kind.write(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 6 // 10])
+    if kind.choice:
+        with pytest.raises(ValueError, match="which are not time"):
+            open_frames(path)
+    found = []
+
+    def read_all() -> None:
+        for frame in open_frames(path, **kind.choice):
+            found.append(frame.pixels.numpy())  # noqa: PERF401, those before the error are wanted
+
+    with pytest.raises(FrameError, match="ends here, but more was promised"):
+        read_all()
+    assert 2 < len(found) < 5
+    np.testing.assert_array_equal(found, kind.levels[: len(found)])
+
+
+def claim(path: Path, side: int) -> None:
+    """A small file whose header says that its frames are so many px high and wide."""
+    if path.suffix == ".png":
+        chunks = {b"IHDR": struct.pack(">II5B", side, side, 8, 0, 0, 0, 0), b"IDAT": zlib.compress(bytes(100))}
+        framed = (struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in chunks.items())
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(framed))
+    elif path.suffix == ".npy":
+        head = f"{{'descr': '|u1', 'fortran_order': False, 'shape': (2, {side}, {side}), }}".ljust(117) + "\n"
+        path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode() + bytes(100))
+    else:
+        tifffile.imwrite(path, NARROW, photometric="minisblack", metadata=None)
+        data = path.read_bytes()
+        path.write_bytes(data.replace(struct.pack("<HHII", 256, 4, 1, 70), struct.pack("<HHII", 256, 4, 1, side)))
+
+
+@pytest.mark.parametrize("name", ["s.png", "s.npy", "s.tif"])
+def test_a_header_that_claims_too_much_is_refused_before_memory_is_asked_for(tmp_path, name):
+    claim(tmp_path / name, 10_000_000)
+    with pytest.raises(ValueError, match=r"claims 10000000 x|exceeds limit of") as caught:
+        open_frames(tmp_path / name)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if name.endswith((".tif", ".png", ".gif", ".webp"))])
+def test_no_damage_of_a_file_is_a_surprise(tmp_path, name):
+    """Whatever byte is wrong: frames, frames with a reason, or a ValueError in one line."""
+    rng, path = np.random.default_rng(len(name)), tmp_path / name
+    KINDS[name].write(path)
+    data, said = np.frombuffer(path.read_bytes(), np.uint8), []
+    for _ in range(12):
+        spoilt = data.copy()
+        spoilt[rng.integers(min(len(data), 400), size=3)] = rng.integers(256, size=3)
+        path.write_bytes(spoilt[: rng.integers(len(data) // 2, len(data) + 1)].tobytes())
+        try:
+            for frame in islice(open_frames(path, **KINDS[name].choice), 20):
+                assert (frame.pixels is None) == (frame.damage is not None)
+        except ValueError as error:
+            said.append(str(error))
+    assert all(len(each.splitlines()) == 1 for each in said)

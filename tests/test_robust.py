@@ -1,4 +1,4 @@
-"""What covers a part of a template bends no pose: blocks that do not fit count less, and how much was believed is told."""
+"""What covers a part of a template bends no pose: blocks that do not fit count less, and how many is told."""
 
 from __future__ import annotations
 
@@ -160,4 +160,6 @@ def test_a_quantile_and_a_median_no_cover_can_raise():
     weight = torch.ones_like(values)
     weight[:, ::2] = 0.9
     assert (weighted_median(spoilt, weight) < 2.01).all()
-    torch.testing.assert_close(weighted_median(values[:, :99], weight[:, :99] * 0 + 1), values[:, :99].median(1, True).values)
+    torch.testing.assert_close(
+        weighted_median(values[:, :99], weight[:, :99] * 0 + 1), values[:, :99].median(1, True).values
+    )

@@ -151,14 +151,17 @@ def _say_numbers(outcome: Any) -> None:
 def compare(**options: Any) -> None:
     """Compare a track.csv with other sensors' record of the same motion, at another rate and untriggered.
 
-    SENSORS is a CSV file with the columns time_s, x_um, y_um and theta_urad, theta_deg or theta_rad.
+    SENSORS is any log in text: columns are found by names such as "Time [ms]", "x_um", "Theta (deg)", or see --columns;
+    at least one of x, y and theta. Exit status 2 if the records were not brought together.
     """
     from torch_ecc.commands import compare as job_of
 
     job = fill(CompareJob, given(options), "compare")
     figures = job_of.write(job, job_of.compare(job))
-    console.print(job_of.report(figures), markup=False)
+    console.print(job_of.report(figures), markup=False, soft_wrap=True)
     console.print(f"In {job.out}/: comparison.json, comparison.png, errors.csv")
+    if not figures["converged"]:
+        sys.exit(2)
 
 
 @app.command()
@@ -242,7 +245,7 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt):
         Console(stderr=True).print("torch-ecc: stopped from the keyboard", style="red")
         sys.exit(INTERRUPTED)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MemoryError) as error:
         Console(stderr=True, highlight=False, soft_wrap=True).print(
             f"torch-ecc: {one_line(error)}", style="red", markup=False
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, field, fields
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch_ecc.records.calibration import Calibration
 from torch_ecc.track.tracker import PREDICTIONS
 
 Point = tuple[float, float]
+SIGNS = ("auto", *map("".join, product("+-", repeat=3)))  # of x, y and theta
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,25 +118,34 @@ class TrackJob(Tracking):
 
 @dataclass(frozen=True)
 class CompareJob:
-    """Settings of ``torch-ecc compare``: the files ``track``, a track.csv, and ``sensors``, a CSV with time_s, x_um,
-    y_um and theta_urad, theta_deg or theta_rad. The last four are those of ``synchrony.Unknowns``."""
+    """Settings of ``torch-ecc compare``: the files ``track``, a track.csv, and ``sensors``, any log with times and one
+    or more of x, y and theta. From ``signs`` on, those of ``synchrony.Unknowns``."""
 
     track: str
     sensors: str
     out: str = described("torch-ecc-comparison", "folder for the outputs")
     template: int = described(0, "which template of the track")
+    columns: str | None = described(
+        None,
+        "the sensors' columns, by name or number, with a unit if their header has none: 'time=Stamp:ms, x=CH 1:um'",
+    )
+    sensors_hz: float | None = described(None, "samples per second of the sensors, if they have no times")
     um_per_px: float | Point | None = described(None, "scale of the camera, if the track has no micrometres")
     axis_angle_deg: float = described(0.0, "from the track's axes to the stage's, as far as known")
     fps: float | None = described(None, "frames per second, if the track has no times")
-    flip_theta: bool = described(False, "the sensors' theta counts the other way (a mirrored view)")
+    signs: str = described("auto", "of the track's x, y and theta against the sensors'; auto tries", SIGNS)
     fixed_angle: bool = described(False, "take the axis angle as given (needed with --lever if only theta moves)")
     scale: bool = described(False, "estimate a factor between the records, too")
     lever: bool = described(False, "estimate where the template lies from the sensors' point, too")
+    rate: bool = described(False, "estimate how much faster one of the clocks is, too")
     exposure_s: float = described(0.0, "exposure of the camera, which averages the motion")
-    max_offset_s: float = described(2.0, "how far the two clocks may be apart")
+    max_offset_s: float | None = described(None, "how far the two clocks may be apart; without it, any time")
 
     def __post_init__(self) -> None:
         _check_rate(self.fps)
+        _check_rate(self.sensors_hz, "sensors_hz")
+        if self.signs not in SIGNS:
+            raise ValueError(f"signs: expected one of {', '.join(SIGNS)}, got {self.signs!r}")
 
 
 @dataclass(frozen=True)
@@ -162,6 +173,6 @@ def span(frames: str | None) -> slice:
     return slice(first, None if last is None else last + 1, step)
 
 
-def _check_rate(fps: float | None) -> None:
-    if fps is not None and not 0 < fps < math.inf:
-        raise ValueError(f"fps: expected a rate > 0 in Hz, got {fps:g}")
+def _check_rate(hz: float | None, name: str = "fps") -> None:
+    if hz is not None and not 0 < hz < math.inf:
+        raise ValueError(f"{name}: expected a rate > 0 in Hz, got {hz:g}")

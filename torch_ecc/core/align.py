@@ -57,4 +57,4 @@ def solve(
     """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype; ``origin``:
     what displacements count from, by default the ``pose``; ``usual`` (B,): the templates' scores so far."""
     engine = native if native.takes(reference, image, settings) else solver
-    return judge(reference, robust.solve(engine, reference, image, pose, settings, usual), pose, settings, origin)
+    return judge(reference, robust.solve(engine.solve, reference, image, pose, settings, usual), pose, settings, origin)

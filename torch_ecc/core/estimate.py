@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -51,6 +51,40 @@ _SENTENCES = {
 }
 
 
+class Calibrated(Protocol):
+    """What turns pixels into micrometres, such as ``Calibration``."""
+
+    def to_physical(self, displacement: Tensor, /) -> Tensor: ...
+    def covariance(self, covariance: Tensor, /) -> Tensor: ...
+
+
+class Physical(NamedTuple):
+    """Displacements (..., 3) in um, um, rad along the axes of a calibration, and their ``covariance`` (..., 3, 3)."""
+
+    displacement: Tensor
+    covariance: Tensor
+
+    @property
+    def x(self) -> Tensor:
+        """(...) um."""
+        return self.displacement[..., 0]
+
+    @property
+    def y(self) -> Tensor:
+        """(...) um."""
+        return self.displacement[..., 1]
+
+    @property
+    def theta_deg(self) -> Tensor:
+        """(...) degrees."""
+        return self.displacement[..., 2].rad2deg()
+
+    @property
+    def sigma(self) -> Tensor:
+        """Standard deviations: (..., 3) um, um, rad."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+
+
 class Estimate(NamedTuple):
     """Poses of R templates in one frame (or B pairs).
 
@@ -76,6 +110,45 @@ class Estimate(NamedTuple):
         """Standard deviations of the pose: (R, 3) px, px, rad."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
 
+    @property
+    def x(self) -> Tensor:
+        """Where the centres are: (R,) px to the right."""
+        return self.pose[..., 0]
+
+    @property
+    def y(self) -> Tensor:
+        """Where the centres are: (R,) px down."""
+        return self.pose[..., 1]
+
+    @property
+    def theta_deg(self) -> Tensor:
+        """The rotations: (R,) degrees, with the sign of eq. 2."""
+        return self.pose[..., 2].rad2deg()
+
+    @property
+    def ok(self) -> Tensor:
+        """Which templates have a new pose, not the last good one: (R,) bool."""
+        return Status.good(self.status)
+
+    def to_um(self, calibration: Calibrated) -> Physical:
+        """The displacements in um, um, rad along the calibration's axes (eq. 3); NaN where a template was not found."""
+        moved = calibration.to_physical(self.displacement)
+        return Physical(torch.where(self.ok[..., None], moved, torch.nan), calibration.covariance(self.covariance))
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame of one row per template (and frame): the columns of track.csv and the other fields.
+
+        ModuleNotFoundError, in words, where there is no pandas.
+        """
+        from torch_ecc.core.readable import to_frame
+
+        return to_frame(self)
+
+    def __repr__(self) -> str:
+        from torch_ecc.core.readable import estimate_text, readable
+
+        return estimate_text(self) if readable(self) else tuple.__repr__(self)
+
     def at(self, index: Tensor) -> Estimate:
         """The templates at ``index`` (n,)."""
         return Estimate(*(value[index] for value in self))
@@ -87,6 +160,11 @@ class Estimate(NamedTuple):
 
 class Track(Estimate):
     """The fields of Estimate stacked over F frames: (F, R, ...)."""
+
+    def __repr__(self) -> str:
+        from torch_ecc.core.readable import readable, track_text
+
+        return track_text(self) if readable(self) else tuple.__repr__(self)
 
     @staticmethod
     @plain

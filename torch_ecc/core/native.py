@@ -76,7 +76,7 @@ def solve(
     """``solver.solve``: poses of B templates in (B or 1, 1, H, W) of one of ``DTYPES`` from ``start`` (B, 3) on, or of
     those that a ``trust`` is about."""
     code, degree = _code(reference.criterion), DEGREE[settings.interpolation]
-    rest = (None, None) if trust is None else (trust.blocks, trust.index)
+    rest = (None, None) if trust is None else (trust.blocks, trust.which)
     *values, partial, moments = operator()(
         image, start, *reference.packed, code, degree, settings.max_iterations, settings.tolerance, *rest
     )

@@ -22,6 +22,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.ambient import lasting
@@ -97,11 +98,11 @@ class Noise(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """Of the blocks of B templates, (B, blocks) each: their weights' ``count``, the weighted sum of ``t`` less its mean
-    and of its ``square``, the mean square of their slopes' texture, ``slope``; and which of those that hold pixels
+    """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean
+    and of its ``square``, the mean square of their slopes' texture, ``slope``, or of those around, if that is more; and which of those that hold pixels
     enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``: either."""
 
-    count: Tensor
+    weight: Tensor
     t: Tensor
     square: Tensor
     slope: Tensor
@@ -298,7 +299,9 @@ def _blocks(reference: Reference) -> Blocks:
     rows = torch.stack((weight, weight * t, weight * t * t, weight * slopes), 1)
     sums = rows.new_zeros(len(t), 4, grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
     count, of_t, square, slope = sums.unbind(1)
-    slope = slope / count.clamp(min=1e-30)
+    slope = (slope / count.clamp(min=1e-30)).view(-1, *grid.blocks)
+    around = F.avg_pool2d(slope, 3, 1, 1, count_include_pad=False)  # blur brings edges from the next block
+    slope = torch.maximum(slope, around).flatten(1)
     enough = count > HALF_FULL * count.amax(1, keepdim=True)
     middle = torch.where(enough, slope, torch.nan).nanmedian(1, keepdim=True).values
     return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle), enough)

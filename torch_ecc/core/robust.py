@@ -8,8 +8,9 @@ where the engine comes to with that trust, until it settles.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import inf
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,29 +22,22 @@ from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution, Trust
 from torch_ecc.core.verdict import correlation, expected_score, within_margin
 
+Engine = Callable[[Reference, Tensor, Tensor, Settings, Trust | None], Solution]  # ``solver.solve``, ``native.solve``
+
 OUTLIER = 3.0  # times the variance that is expected of a block: beyond it less and less is believed
 DISTRUST = 3.0  # trust = (OUTLIER / ratio)^this
 NO_TRUST = 0.02  # less is none
 QUANTILE, TO_MEDIAN = 0.3, 1.13  # of the blocks' variances: a scale that covers of well over half cannot raise
 LEAST_SLIP, SLIP = 0.00125, 0.045  # px^2 / 2: blocks may seem to have slipped by 0.05 px rms, as of the sampler,
-FIRST_SLIP = 1.0  # to 0.3 px, as of blur; before the solve by more
+FIRST_SLIP = 1.0  # to 0.3 px; before the solve by more
+LARGEST_SLIP = 0.5  # where all do, as of blur, nothing need cover any of them
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS = 5
-FITS = 1.6  # as ``cost`` counts: well believed by more than half, and nothing else is tried
+CLEARLY_LESS = 0.85  # of the cost of least squares: where all edges fit worse, as by blur, leaving them out gains little
+FITS = 1.4  # median excess: nothing else is tried
 BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
 SETTLED = 0.01  # of the template's weight: trust changes no more
-
-
-class Engine(Protocol):
-    """A whole implementation of the loop: ``solver`` or ``native``."""
-
-    @staticmethod
-    def solve(
-        reference: Reference, image: Tensor, start: Tensor, settings: Settings, trust: Trust | None = None
-    ) -> Solution:
-        """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on, or of those that ``trust`` is about."""
-        ...
 
 
 class Scale(NamedTuple):
@@ -54,59 +48,60 @@ class Scale(NamedTuple):
 
 
 class Doubted(NamedTuple):
-    """Templates at ``index`` (n,) of a solve that are solved again: what they have in each block, the ``floor`` (n, 1)
-    of the noise's variance and their ``usual`` (n,) score."""
+    """Templates at ``which`` (n,) of a solve by an ``engine`` that are solved again: what they have in their blocks,
+    the ``floor`` (n, 1) of the noise's variance and their ``usual`` (n,) score."""
 
     engine: Engine
     reference: Reference
     image: Tensor
     settings: Settings
-    index: Tensor
+    which: Tensor
     blocks: Blocks
     floor: Tensor
     usual: Tensor
 
+    @staticmethod
+    def of(engine: Engine, reference: Reference, image: Tensor, settings: Settings, usual: Tensor) -> Doubted:
+        """All of them."""
+        which = torch.arange(len(usual), device=usual.device)
+        return Doubted(engine, reference, image, settings, which, reference.blocks, least_noise(reference), usual)
+
     def at(self, part: Tensor) -> Doubted:
         """Some of them."""
         blocks = each(lambda value: value[part], self.blocks)
-        return self._replace(index=self.index[part], blocks=blocks, floor=self.floor[part], usual=self.usual[part])
-
-    def any_scale(self, slip: float) -> Scale:
-        """No limit to the noise."""
-        return Scale(self.floor + inf, torch.full_like(self.floor, slip))
+        return self._replace(which=self.which[part], blocks=blocks, floor=self.floor[part], usual=self.usual[part])
 
     def solve(self, start: Tensor, settings: Settings, trusted: Tensor) -> Solution:
         """From ``start`` (B, 3) on, with blocks (n, blocks) as they are trusted."""
-        return self.engine.solve(self.reference, self.image, start, settings, Trust(self.index, trusted))
+        return self.engine(self.reference, self.image, start, settings, Trust(self.which, trusted))
 
 
 def solve(
     engine: Engine, reference: Reference, image: Tensor, start: Tensor, settings: Settings, usual: Tensor | None = None
 ) -> Solution:
     """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on; ``usual`` (B,): their scores so far."""
-    found = engine.solve(reference, image, start, settings)
+    found = engine(reference, image, start, settings, None)
     if not settings.robust:
         return found
     usual, on_cpu = expected_score(reference) if usual is None else usual, is_cpu(start.device)
     odd = unusual(reference, found, usual)
     if on_cpu and not odd.any():
         return found
-    index = odd.nonzero()[:, 0] if on_cpu else torch.arange(len(start), device=start.device)  # no look of the host there
-    blocks = each(lambda value: value[index], reference.blocks)
-    doubted = Doubted(
-        engine, reference, image, settings, index, blocks, least_noise(reference)[index], usual[index]
-    )
-    plain = each(lambda value: value[index], found)
-    doubtful = has_outliers(doubted, plain) | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
-    if on_cpu and not doubtful.all():
+    doubted, plain = Doubted.of(engine, reference, image, settings, usual), found
+    if on_cpu:  # nowhere else does the host ask which ones
+        doubted, plain = doubted.at(odd), each(lambda value: value[odd], found)
+    uneven = has_outliers(doubted, plain)
+    doubtful = uneven | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
+    if on_cpu:
         if not doubtful.any():
             return found
-        doubted, plain, doubtful = doubted.at(doubtful), each(lambda value: value[doubtful], plain), doubtful[doubtful]
-    again = solved_again(doubted, start, plain)
-    plain = plain._replace(trust=torch.ones_like(plain.sums[:, 0]))
-    chosen = each(lambda old, new: _where(doubtful, new, old), plain, again)
+        doubted, plain = doubted.at(doubtful), each(lambda value: value[doubtful], plain)
+        uneven, doubtful = uneven[doubtful], doubtful[doubtful]
+    again, fits = solved_again(doubted, start, plain)
+    # Noise may have grown in all of the patch: then least squares is right, and leaving out most of it is not.
+    again = chosen(doubtful & (uneven | fits), again, plain._replace(trust=torch.ones_like(plain.sums[:, 0])))
     found = found._replace(trust=torch.ones_like(found.sums[:, 0]))
-    return each(lambda old, new: old.index_copy(0, doubted.index, new), found, chosen)
+    return each(lambda old, new: old.index_copy(0, doubted.which, new), found, again)
 
 
 def unusual(reference: Reference, found: Solution, usual: Tensor) -> Tensor:
@@ -118,42 +113,46 @@ def unusual(reference: Reference, found: Solution, usual: Tensor) -> Tensor:
 
 def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
     """Which templates (n,) have blocks that fit far worse than others."""
-    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], doubted.any_scale(SLIP))
+    most = Scale(doubted.floor + inf, torch.full_like(doubted.floor, LARGEST_SLIP))
+    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
     return ~(ratio <= OUTLIER).all(1)
 
 
-def solved_again(doubted: Doubted, start: Tensor, plain: Solution) -> Solution:
-    """The best of what trust leads to that begins with the residuals of least squares, or with those under a median
-    fit, at the ``start`` (B, 3) and where least squares has come to, unless it has slid away with the cover."""
-    there = start.index_copy(0, doubted.index, plain.pose)
-    way = ((there - start) * doubted.reference.place.lever)[doubted.index]
-    slid = ~(torch.linalg.vector_norm(way, dim=1) < BASIN)
+def solved_again(doubted: Doubted, start: Tensor, plain: Solution) -> tuple[Solution, Tensor]:
+    """The best, and whether it fits (n,), of what trust leads to that begins with the residuals of least squares, or
+    with those under a median fit, at the ``start`` (B, 3) or where least squares has come to, and has not slid away."""
+    there = start.index_copy(0, doubted.which, plain.pose)
+    here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
     first = compared(doubted, variance, seen, usual_scale(doubted, plain, plain.gain.unsqueeze(1), SLIP))
-    best, least = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain)
+    best, (least, fits) = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain)
+    least = CLEARLY_LESS * least
     for place, begin in ((there, first), (start, None), (there, None)):
-        found = reweighted(doubted, place, median_look(doubted, place) if begin is None else begin)
-        price = cost(doubted, found)
-        better = (price < least) & ~(slid & (place is there))
-        best, least = each(lambda old, new: _where(better, new, old), best, found), torch.where(better, price, least)
-        if is_cpu(start.device) and bool((least < FITS).all()):
+        found = reweighted(doubted, place, begin or median_look(doubted, place))
+        price, well = cost(doubted, found)
+        near = torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < BASIN
+        better = (price < least) & near
+        best = chosen(better, found, best)
+        least, fits = torch.where(better, price, least), torch.where(better, well, fits)
+        if is_cpu(start.device) and bool(fits.all()):
             break
-    return best
+    return best, fits
 
 
-def cost(doubted: Doubted, found: Solution) -> Tensor:
-    """What is left of templates (n,), in blocks at most OUTLIER times what is usual: the mean over their weight, 1 if
-    all is noise and OUTLIER if nothing fits (the truncated squares that re-weighting makes least)."""
+def cost(doubted: Doubted, found: Solution) -> tuple[Tensor, Tensor]:
+    """What is left of templates (n,) when the noise is the usual one: the mean log of the blocks' excess, which asks
+    less of what does not fit at all than of how much fits; and whether most do fit."""
     seen = found.sums[:, 0]
     scale = usual_scale(doubted, found, found.gain.unsqueeze(1), LEAST_SLIP)
-    ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(0, OUTLIER)
-    value = (ratio.nan_to_num(OUTLIER) * seen).sum(1) / seen.sum(1).clamp(min=LEAST)
-    return torch.where(found.gain > 0, value, OUTLIER)
+    ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(min=1).nan_to_num(inf, inf)
+    value = (ratio.log() * seen).sum(1) / seen.sum(1).clamp(min=LEAST)
+    fits = weighted_median(ratio, seen)[:, 0] < FITS
+    return torch.where(found.gain > 0, value, inf), fits & (found.gain > 0)
 
 
 def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:
     """Scale and excess (n, blocks) under a median fit at ``place`` (B, 3)."""
-    look = doubted.solve(place, doubted.settings.once, torch.ones_like(doubted.blocks.count))
+    look = doubted.solve(place, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
     variance, gain = median_fit(look.sums, doubted.blocks)
     return compared(doubted, variance, look.sums[:, 0], usual_scale(doubted, look, gain, FIRST_SLIP))
 
@@ -168,10 +167,10 @@ def reweighted(doubted: Doubted, place: Tensor, first: tuple[Scale, Tensor]) -> 
         most = Scale(scale.noise, scale.slip.clamp(max=SLIP))  # no cover may talk itself in
         scale, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
         after = trust(ratio)
-        change = ((after - before).abs() * blocks.count).sum(1)
-        if is_cpu(place.device) and bool((change <= SETTLED * blocks.count.sum(1)).all()):
+        change = ((after - before).abs() * blocks.weight).sum(1)
+        if is_cpu(place.device) and bool((change <= SETTLED * blocks.weight.sum(1)).all()):
             break
-        place = place.index_copy(0, doubted.index, found.pose)
+        place = place.index_copy(0, doubted.which, found.pose)
     return found._replace(trust=before)
 
 
@@ -193,9 +192,9 @@ def usual_variance(normal: Normal, gain: Tensor, usual: Tensor) -> Tensor:
     return (1 - usual * usual) * gain.square() * normal.energy / normal.total.clamp(min=LEAST)
 
 
-def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Of values (n, ...) those ``chosen`` (n,)."""
-    return torch.where(chosen.view(-1, *[1] * (new.dim() - 1)), new, old)
+def chosen(better: Tensor, new: Solution, old: Solution) -> Solution:
+    """Of n templates the ``new`` answer where it is ``better`` (n,)."""
+    return each(lambda a, b: torch.where(better.view(-1, *[1] * (a.dim() - 1)), a, b), new, old)
 
 
 def trust(ratio: Tensor) -> Tensor:
@@ -228,7 +227,7 @@ def robust_scale(variance: Tensor, blocks: Blocks, seen: Tensor, floor: Tensor, 
 
     ``seen`` (B, n): weight in sight; ``floor`` (B, 1): the least noise; ``most``: the largest scale.
     """
-    there = seen > SEEN * blocks.count
+    there = seen > SEEN * blocks.weight
     noise = quantile(variance, blocks.flat & there).minimum(most.noise).maximum(floor)
     slip = quantile((variance - noise) / blocks.slope.clamp(min=LEAST), blocks.steep & there)
     return Scale(noise, slip.clamp(min=LEAST_SLIP).minimum(most.slip))
@@ -246,7 +245,7 @@ def median_fit(sums: Tensor, blocks: Blocks) -> tuple[Tensor, Tensor]:
     """Each block's mean square (B, n) of what gain * t + offset leaves of it, and the gain (B, 1): the median of those
     of single blocks, weighted by their contrast, as is the offset. A minority of blocks does not move them."""
     weight, g, gg, tg = sums[:, :4].unbind(1)
-    seen, some = weight / blocks.count.clamp(min=LEAST), weight.clamp(min=LEAST)
+    seen, some = weight / blocks.weight.clamp(min=LEAST), weight.clamp(min=LEAST)
     t, tt = blocks.t * seen, blocks.square * seen
     contrast = (tt - t * t / some).clamp(min=0)
     gain = weighted_median((tg - t * g / some) / contrast.clamp(min=LEAST), contrast * blocks.steep)

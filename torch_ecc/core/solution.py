@@ -15,9 +15,9 @@ FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 
 
 class Trust(NamedTuple):
-    """Of the templates at ``index`` (n,): by how much the pixels of their ``blocks`` (n, blocks) count, 0 to 1."""
+    """Of the templates at ``which`` (n,): by how much the pixels of their ``blocks`` (n, blocks) count, 0 to 1."""
 
-    index: Tensor
+    which: Tensor
     blocks: Tensor
 
 

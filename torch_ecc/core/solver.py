@@ -51,8 +51,8 @@ def solve(
     CPU in chunks that fit its cache."""
     image, blocks = image.float(), None
     if trust is not None:
-        blocks, reference, start = trust.blocks, reference.select(trust.index), start[trust.index]
-        image = image if len(image) == 1 else image[trust.index]
+        blocks, reference, start = trust.blocks, reference.select(trust.which), start[trust.which]
+        image = image if len(image) == 1 else image[trust.which]
     many = len(start)
     some = max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1) if is_cpu(start.device) else many
     if many <= some:

@@ -60,15 +60,7 @@ def judge(
     scatter = cluster_robust(reference, normal, total[:, 10:] / of_both.unsqueeze(1), variance)
     alias = interpolation_error(reference, axes, settings.interpolation)
     covariance = pose_covariance(reference, normal, variance, of_both / power, axes, scatter, alias)
-    visible = believed = torch.ones_like(score)
-    if found.trust is not None:
-        believed = coverage(found)
-        visible = normal.total / (reference.normal.total * believed)
-        left = normal.bread.diagonal(dim1=1, dim2=2) / reference.normal.bread.diagonal(dim1=1, dim2=2)
-        enough = left.amin(1) >= LEAST_INFORMATION * visible
-        believed = torch.where(enough, believed, believed.clamp(max=0.0))
-    elif normal is not reference.normal:
-        visible = normal.total / reference.normal.total
+    visible, believed = seen_and_believed(reference, found)
     unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
     status = decide(torch.stack((visible, believed, match, found.gain, *unobservable, found.error, score), 1), settings)
     rms = (error / normal.total).sqrt()
@@ -80,7 +72,7 @@ def judge(
         rms = torch.where(unfitted, (total[:, 2] / normal.total.clamp(min=LEAST)).sqrt(), rms)
         good = Status.good(status)
         pose = torch.where(good[:, None], pose, start)
-        covariance = torch.where(good[:, None, None], covariance, _unknown(pose.dtype, pose.device))
+        covariance = torch.where(good[:, None, None], covariance, unknown(covariance))
     moved = pose - (start if origin is None else origin)
     return Estimate(
         pose,
@@ -113,11 +105,17 @@ def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tup
     return sign, limit, torch.tensor(VERDICTS, dtype=torch.int8, device=device)
 
 
-def coverage(found: Solution) -> Tensor:
-    """Share (B,) of the weight in sight that was believed."""
-    seen, dtype = found.sums[:, 0], found.pose.dtype
-    believed = seen if found.trust is None else seen * found.trust
-    return believed.sum(1, dtype=dtype) / seen.sum(1, dtype=dtype).clamp(min=LEAST)
+def seen_and_believed(reference: Reference, found: Solution) -> tuple[Tensor, Tensor]:
+    """The share (B,) of the template's weight in sight, and of that what was believed: 0 if that holds next to none of
+    the information."""
+    normal, whole = found.normal, reference.normal
+    if found.trust is None:
+        all_of_it = torch.ones_like(found.error)
+        return all_of_it if normal is whole else normal.total / whole.total, all_of_it
+    seen = found.sums[:, 0].sum(1, dtype=normal.total.dtype)
+    visible, believed = seen / whole.total, normal.total / seen.clamp(min=LEAST)
+    information = (normal.bread.diagonal(dim1=1, dim2=2) / whole.bread.diagonal(dim1=1, dim2=2)).amin(1)
+    return visible, torch.where(information >= LEAST_INFORMATION * visible, believed, 0.0)
 
 
 def expected_score(reference: Reference) -> Tensor:
@@ -223,10 +221,14 @@ def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = 
     return normal.noise_share * (power if variance is None else torch.minimum(power, variance))
 
 
+def unknown(covariance: Tensor) -> Tensor:
+    """The ``covariance`` (..., 3, 3) of what was not found: (3, 3)."""
+    return _infinite(covariance.dtype, covariance.device)
+
+
 @lru_cache(maxsize=16)
 @torch.inference_mode(False)
-def _unknown(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The covariance of what was not found."""
+def _infinite(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.diag(torch.full((3,), inf, dtype=dtype, device=device))
 
 

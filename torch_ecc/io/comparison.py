@@ -1,4 +1,4 @@
-"""The files of a comparison: a track.csv and a sensors' CSV in, a table of errors out."""
+"""The files of a comparison: a track.csv and a sensors' log in, a table of errors out."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_ecc.io.columns import Column, choose, values
+from torch_ecc.io.logs import Log, read_log
 from torch_ecc.io.records import CONVERGED, DOUBTFUL
 
-_ANGLES = {"theta_rad": 1.0, "theta_urad": 1e-6, "theta_deg": math.pi / 180}
 _DISPLACEMENT = ("dx_px", "dy_px", "dtheta_rad")
+_AXES = ("x", "y", "theta")
 
 
 class SensorTable(NamedTuple):
-    """``time_s`` (S,) and ``pose`` (S, 3) um, um, rad; NaN where a cell is empty."""
+    """``time_s`` (S,), ``pose`` (S, 3) um, um, rad, NaN where a cell is empty and for a component that is not there,
+    and in words from which columns they are."""
 
     time_s: NDArray[np.float64]
     pose: NDArray[np.float64]
+    said: str
 
 
 class TrackTable(NamedTuple):
@@ -35,38 +39,52 @@ class TrackTable(NamedTuple):
     found: NDArray[np.bool_]
 
 
-def read_sensors(path: str | Path) -> SensorTable:
-    """Columns time_s, x_um, y_um and one of theta_rad, theta_urad, theta_deg, in any order among others.
+def read_sensors(path: str | Path, columns: str | None = None, rate_hz: float | None = None) -> SensorTable:
+    """A log with times and at least one of x, y and theta: see ``logs`` and, for ``columns``, ``columns.choose``.
 
+    ``rate_hz``: samples per second, instead of a column of times. Rows in reverse order are turned round.
     FileNotFoundError; ValueError for missing columns (the message lists those found), for words among the numbers, and
-    for times that do not increase, with the line.
+    for times that go back, with the line.
     """
-    table = _Columns(path)
-    angle = [name for name in _ANGLES if name in table.cells]
-    if len(angle) != 1:
-        raise ValueError(f"{path}: expected one column of {', '.join(_ANGLES)}; columns found: {table.names}")
-    time = table.numbers("time_s")
-    table.check_times(time)
-    theta = _ANGLES[angle[0]] * table.numbers(angle[0])
-    return SensorTable(time, np.stack((table.numbers("x_um"), table.numbers("y_um"), theta), -1))
+    log = read_log(path)
+    chosen = choose(log, columns)
+    if rate_hz is not None:
+        chosen.pop("time", None)
+        time, words = np.arange(len(log.lines)) / rate_hz, [f"time = rows at {rate_hz:g} Hz"]
+    elif "time" in chosen:
+        time, words = values(log, "time", chosen["time"]), [_words("time", chosen["time"])]
+    else:
+        raise ValueError(f"{path}: no column of times found, see --columns 'time=NAME' and --sensors-hz; {_found(log)}")
+    axes = [role for role in _AXES if role in chosen]
+    if not axes:
+        raise ValueError(f"{path}: no column of x, y or theta found, see --columns 'x=NAME:UNIT, ...'; {_found(log)}")
+    pose = np.full((len(time), 3), math.nan)
+    for role in axes:
+        pose[:, _AXES.index(role)] = values(log, role, chosen[role])
+    if len(time) > 1 and (np.diff(time) <= 0).all() and time[-1] < time[0]:
+        time, pose = time[::-1].copy(), pose[::-1].copy()
+        words.append("last row first")
+    else:
+        _check_times(log, time)
+    return SensorTable(time, pose, ", ".join([words[0], *(_words(role, chosen[role]) for role in axes), *words[1:]]))
 
 
 def read_track(path: str | Path, template: int = 0) -> TrackTable:
     """One template of a track.csv. Errors as ``read_sensors``; ValueError if that template is not in it."""
-    table = _Columns(path)
-    number = table.numbers("template")
+    log = read_log(path)
+    number = log.numbers("template")
     rows = number == template
     if not rows.any():
         known = ", ".join(f"{k:g}" for k in np.unique(number))
         raise ValueError(f"template: {path} has the templates {known}, got {template}")
-    table = table.take(rows)
-    time = table.numbers("time_s") if "time_s" in table.cells else None
+    log = log.take(rows)
+    time = log.numbers("time_s") if "time_s" in log.names else None
     if time is not None:
-        table.check_times(time)
-    um = np.stack([table.numbers(name) for name in ("dx_um", "dy_um")], -1) if "dx_um" in table.cells else None
-    found = np.array([word in (CONVERGED, DOUBTFUL) for word in table.words("status")])
-    displacement = np.stack([table.numbers(name) for name in _DISPLACEMENT], -1)
-    return TrackTable(table.numbers("frame"), time, displacement, um, found)
+        _check_times(log, time)
+    um = np.stack([log.numbers(name) for name in ("dx_um", "dy_um")], -1) if "dx_um" in log.names else None
+    found = np.isin(log.column("status"), (CONVERGED, DOUBTFUL))
+    displacement = np.stack([log.numbers(name) for name in _DISPLACEMENT], -1)
+    return TrackTable(log.numbers("frame"), time, displacement, um, found)
 
 
 def write_table(path: Path, columns: Mapping[str, Sequence[Any]], formats: Mapping[str, str]) -> None:
@@ -79,72 +97,22 @@ def write_table(path: Path, columns: Mapping[str, Sequence[Any]], formats: Mappi
             writer.writerow(["" if isinstance(v, float) and not math.isfinite(v) else form % v for v, form in cells])
 
 
-class _Columns:
-    """The cells of a CSV file by column, with the line that each row stands in."""
-
-    def __init__(self, path: str | Path) -> None:
-        self.path, self.cells, self.lines = path, {}, np.zeros(0, np.int64)
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"no such file: {path}")
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = [name.strip() for name in next(reader, [])]
-            rows, lines = [], []
-            for row in reader:
-                if row and len(row) != len(header):
-                    raise ValueError(f"{path}: line {reader.line_num} must have {len(header)} cells, got {len(row)}")
-                if row:
-                    rows.append(row)
-                    lines.append(reader.line_num)
-        if not rows:
-            raise ValueError(f"{path}: expected a header and rows of numbers, got {len(header)} columns without a row")
-        self.cells = {name: np.array(cells) for name, cells in zip(header, zip(*rows, strict=True), strict=True)}
-        self.lines = np.array(lines)
-
-    @property
-    def names(self) -> str:
-        """The columns, for messages."""
-        return ", ".join(self.cells)
-
-    def take(self, rows: NDArray[np.bool_]) -> _Columns:
-        """The same columns with some of the rows."""
-        part = object.__new__(_Columns)
-        part.path, part.lines = self.path, self.lines[rows]
-        part.cells = {name: cells[rows] for name, cells in self.cells.items()}
-        return part
-
-    def words(self, name: str) -> NDArray[np.str_]:
-        """The cells of a column as text."""
-        if name not in self.cells:
-            raise ValueError(f"{self.path}: column {name} is missing; columns found: {self.names}")
-        return self.cells[name]
-
-    def numbers(self, name: str) -> NDArray[np.float64]:
-        """The cells of a column as numbers, NaN where a cell is empty."""
-        cells = np.char.strip(self.words(name))
-        try:
-            return np.where(cells == "", "nan", cells).astype(np.float64)
-        except ValueError:
-            wrong = next(k for k, cell in enumerate(cells) if cell and not _is_number(cell))
-            place = f"{self.path}: line {self.lines[wrong]}, column {name}"
-            raise ValueError(f"{place}: expected a number, got {str(cells[wrong])!r}") from None
-
-    def check_times(self, time: NDArray[np.float64]) -> None:
-        """ValueError with the line for a time that is missing or does not increase."""
-        wrong = np.flatnonzero(~np.isfinite(time))
-        if len(wrong):
-            raise ValueError(f"{self.path}: line {self.lines[wrong[0]]}: time_s must be a finite number")
-        back = np.flatnonzero(np.diff(time) <= 0)
-        if len(back):
-            k = back[0] + 1
-            raise ValueError(
-                f"{self.path}: line {self.lines[k]}: time_s must increase, {time[k]:g} follows {time[k - 1]:g}"
-            )
+def _check_times(log: Log, time: NDArray[np.float64]) -> None:
+    """ValueError with the line for a time that is missing or goes back."""
+    wrong = np.flatnonzero(~np.isfinite(time))
+    if len(wrong):
+        raise ValueError(f"{log.path}: line {log.lines[wrong[0]]}: time_s must be a finite number")
+    back = np.flatnonzero(np.diff(time) < 0)
+    if len(back):
+        k = back[0] + 1
+        raise ValueError(
+            f"{log.path}: line {log.lines[k]}: times must increase, {time[k]:.9g} follows {time[k - 1]:.9g}"
+        )
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+def _words(role: str, column: Column) -> str:
+    return f"{role} = {column.name!r} in {column.unit}" if column.unit else f"{role} = {column.name!r}"
+
+
+def _found(log: Log) -> str:
+    return f"columns found: {', '.join(log.names)}"

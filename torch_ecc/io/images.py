@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -19,22 +19,32 @@ from torch_ecc.io.frames import Medium, Pixels, Raw, brief, check_size
 from torch_ecc.io.tiff import TIFF, open_tiff
 
 IMAGES = TIFF | {".png", ".bmp", ".jpg", ".jpeg", ".jp2", ".webp", ".pgm", ".ppm", ".pnm"}
-_JPEG = (".jpg", ".jpeg")
 _SAME = {".tiff": ".tif", ".jpeg": ".jpg"}
 # A number with a decimal point is one number; of more than two parts, as in dates and versions, each is its own.
-_NUMBER = re.compile(r"((?<![0-9.])[0-9]+\.[0-9]+(?![0-9.]|\.[0-9])|[0-9]+)")
+_DECIMAL = r"(?<![0-9.])[0-9]+\.([0-9]+)(?![0-9]|\.[0-9])"
+_NUMBER = re.compile(f"({_DECIMAL.replace('([0-9]+)', '[0-9]+')}|[0-9]+)")
+_WHOLE = re.compile("([0-9]+)")
 _TOLD_GAPS = 3
 
 
-def natural_key(path: Path) -> list[str | Fraction]:
-    """Sorts f2 before f10, and t_0.5s before t_1s."""
-    parts = _NUMBER.split(path.with_suffix("").as_posix().casefold())
-    return [Fraction(part) if k % 2 else part for k, part in enumerate(parts)] + [path.suffix.casefold()]
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """By the numbers in their names: f2 before f10, and t_0.5s before t_1s."""
+    paths = list(paths)
+    fractions = {each for path in paths for each in re.findall(_DECIMAL, path.stem)}
+    # 1.9 and 1.10 are two numbers with a point between them: nobody writes the decimal 1.1 like this beside 1.9.
+    counted = len({len(each) for each in fractions}) > 1 and any(each[1:].endswith("0") for each in fractions)
+    number = _WHOLE if counted else _NUMBER
+
+    def key(path: Path) -> list[str | Fraction]:
+        parts = number.split(path.with_suffix("").as_posix().casefold())
+        return [Fraction(part) if k % 2 else part for k, part in enumerate(parts)] + [path.suffix.casefold()]
+
+    return sorted(paths, key=key)
 
 
 def open_images(paths: Sequence[Path], where: str, choice: Choice) -> Medium:
     """One frame per file, in natural order; ValueError if none of the files is an image, or two formats are mixed."""
-    images = sorted((path for path in paths if path.suffix.lower() in IMAGES), key=natural_key)
+    images = in_order(path for path in paths if path.suffix.lower() in IMAGES)
     if not images:
         raise ValueError(f"open_frames: no image in {where} (known: {' '.join(sorted(IMAGES))})")
     kinds = Counter(_SAME.get(path.suffix.lower(), path.suffix.lower()) for path in images)
@@ -52,21 +62,17 @@ def open_images(paths: Sequence[Path], where: str, choice: Choice) -> Medium:
 
 
 def _read_file(path: Path, number: int, choice: Choice) -> Raw:
-    kind, colours = path.suffix.lower(), None
     try:
         if path.stat().st_size == 0:
             raise ValueError("it is empty")
-        if kind in TIFF:
-            pixels = _read_tiff(path, choice)
-        elif kind in _JPEG:
-            pixels, colours = _read_jpeg(path, "L"), lambda: _read_jpeg(path, "RGB")
-        else:
-            pixels = _read_image(path)
+        if path.suffix.lower() in TIFF:
+            return Raw(number, _read_tiff(path, choice), name=path.name)
+        pixels, colours = _read_image(path)
+        return Raw(number, pixels, name=path.name, colours=colours)
     except UnidentifiedImageError:
         return Raw(number, f"{path.name} cannot be read (it is damaged or not an image)", name=path.name)
     except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         return Raw(number, f"{path.name} cannot be read ({brief(error)})", name=path.name)
-    return Raw(number, pixels, name=path.name, colours=colours)
 
 
 def _read_tiff(path: Path, choice: Choice) -> Pixels:
@@ -79,19 +85,31 @@ def _read_tiff(path: Path, choice: Choice) -> Pixels:
     return first.pixels
 
 
-def _read_jpeg(path: Path, mode: str) -> Pixels:
-    """As it is stored, whatever orientation it tells of; mode "L" is the luma as it was coded."""
-    with Image.open(path) as image:
-        check_size("it", *image.size)
-        if image.mode in ("L", "RGB"):
-            image.draft(mode, image.size)
-        return np.array(image if image.mode == mode else image.convert("RGB").convert(mode))
-
-
-def _read_image(path: Path) -> Pixels:
+def _read_image(path: Path) -> tuple[Pixels, Callable[[], Pixels] | None]:
+    """As it is stored, whatever orientation it tells of, and how its colours are had if these are its grey levels."""
     with Image.open(path) as image:  # its header, and the checksums of PNG: OpenCV tells neither before it decodes
         check_size("it", *image.size)
-        image.verify()
+        kind = image.format
+        if kind != "JPEG":
+            image.verify()
+    if kind == "JPEG":
+        return _by_pillow(path, "L"), lambda: _by_pillow(path, "RGB")
+    pixels = _by_opencv(path)
+    if kind == "JPEG2000" and pixels.dtype == np.uint8:
+        return _by_pillow(path, None), None  # OpenCV passes over its palettes
+    return pixels, None
+
+
+def _by_pillow(path: Path, mode: str | None) -> Pixels:
+    """In this mode, of which "L" is the luma of a JPEG as it was coded; without one, in L or RGB."""
+    with Image.open(path) as image:
+        if mode and image.mode in ("L", "RGB"):
+            image.draft(mode, image.size)
+        plain = mode or ("L" if image.mode in ("L", "LA") else "RGB")
+        return np.array(image if image.mode == plain else image.convert("RGB").convert(plain))
+
+
+def _by_opencv(path: Path) -> Pixels:
     log = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

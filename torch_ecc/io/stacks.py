@@ -19,7 +19,7 @@ import numpy as np
 from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_dtype, check_size
 
 _SHAPES = "(F, H, W), (F, H, W, channels) or (F, channels, H, W) with 1, 3 or 4 channels"
-_DAMAGE = (OSError, EOFError, BadZipFile, zlib.error)
+_DAMAGE = (OSError, EOFError, BadZipFile, zlib.error, NotImplementedError, RuntimeError)
 _Opener: TypeAlias = Callable[[], Any]
 
 
@@ -71,7 +71,7 @@ def open_npz(path: Path) -> Medium:
     try:
         with ZipFile(path) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-    except BadZipFile as error:
+    except _DAMAGE as error:
         raise ValueError(f"open_frames: {path} cannot be read as .npz ({brief(error)})") from error
     if "frames" not in names and len(names) != 1:
         raise ValueError(f"open_frames: {path} must hold one array, or one named 'frames'; it holds {names}")

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tifffile
 from PIL import Image
 
 from torch_ecc.io.axes import Choice, Walk, walk
@@ -44,6 +43,8 @@ class _Planes(NamedTuple):
 def open_tiff(path: Path, choice: Choice) -> Medium:
     """One frame per page, or per time where the file describes its axes. ValueError if it is no TIFF, or if it has
     channels, slices or positions and none is chosen."""
+    import tifffile  # a tenth of a second, which a video need not wait for
+
     try:
         tif: Any = tifffile.TiffFile(path)
         page = tif.pages.first
@@ -173,7 +174,7 @@ def _one_after_the_other(tif: Any, page: Any, steps: Walk) -> _Planes:
 def _series_reader(series: Any, path: Path, samples: int) -> Callable[[int], Pixels]:
     """Reads the planes of a series by number; ``samples`` of them share a page."""
     shape = [size for letter, size in zip(series.axes, series.shape, strict=True) if letter in "YXS"]
-    depth = max(math.prod(series.shape) // math.prod(shape) // len(series), 1)
+    depth = max(math.prod(series.shape) // max(math.prod(shape), 1) // len(series), 1)
 
     def read(plane: int) -> Pixels:
         page = series[plane // samples // depth]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any, TypeAlias
 
 import av
 import numpy as np
+from av.video.reformatter import VideoReformatter
 
 from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_size
 
@@ -17,6 +20,8 @@ VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
 _SLACK_FRAMES, _SLACK = 3, 0.02
 _STRICT = {"err_detect": "explode"}  # a frame that is damaged is told, and not made up from its neighbours
 _PACKED = {"yuyv422": 0, "yvyu422": 0, "uyvy422": 1}  # where the first luma byte stands among chroma bytes
+
+_conversion = threading.local()  # to colours: made once for a thread, and not, six times as dear, for each frame
 
 _Decoded: TypeAlias = "av.VideoFrame | str"
 
@@ -58,9 +63,13 @@ def _rate(container: Any, stream: Any) -> float | None:
 
 
 def _declared(container: Any, stream: Any) -> int:
-    """How many frames the container says it holds, 0 if it does not."""
-    fps = _rate(container, stream)
-    return stream.frames or (round(container.duration / av.time_base * fps) if fps and container.duration else 0)
+    """How many frames the container says it shows, 0 if it does not."""
+    fps, seconds, frames = _rate(container, stream), (container.duration or 0) / av.time_base, int(stream.frames)
+    by_time = round(seconds * fps) if fps else 0
+    if not frames:
+        return by_time if len(container.streams) == 1 else 0  # the duration may be that of a longer sound
+    # Of MP4 and its kin a trim only hides frames, which are counted all the same.
+    return min(frames, by_time or frames) if "mp4" in container.format.name else frames
 
 
 def _read(path: Path, options: dict[str, str], numbers: range) -> Iterator[Raw]:
@@ -86,22 +95,29 @@ def _decoded(container: Any, stream: Any) -> Iterator[tuple[float | None, _Decod
     that are predicted from it, up to the next one that stands by itself."""
     damaged: list[tuple[float, str]] = []
     tainted = False
+    # AVI tells when frames are decoded and not when they are shown; FFmpeg guesses that, up to one dropped frame off.
+    # The k-th frame to be shown is so at the k-th of these times.
+    slots: deque[float] = deque()
+    guessed = container.format.name == "avi"
     try:
         for packet in container.demux(stream):
             if packet.size == 0 and packet.dts is not None:
                 continue  # a dropped frame: its time passes, and there is nothing to decode
+            if guessed and packet.dts is not None:
+                slots.append(float(packet.dts * packet.time_base))
             try:
                 frames = packet.decode()
             except av.FFmpegError as error:
-                time = packet.pts if packet.pts is not None else packet.dts
-                damaged.append((float((time or 0) * packet.time_base), f"it cannot be decoded ({error.strerror})"))
+                time = float((packet.pts or 0) * packet.time_base) if not slots else slots.pop()
+                damaged.append((time, f"it cannot be decoded ({error.strerror})"))
                 tainted = True
                 continue
             for frame in frames:
-                while damaged and frame.time is not None and damaged[0][0] < frame.time:
+                time = slots.popleft() if slots else frame.time
+                while damaged and time is not None and damaged[0][0] < time:
                     yield damaged.pop(0)
                 tainted = frame.is_corrupt or (tainted and not frame.key_frame)
-                yield frame.time, "it is damaged, or predicted from a frame that is" if tainted else frame
+                yield time, "it is damaged, or predicted from a frame that is" if tainted else frame
     except av.FFmpegError as error:
         damaged.append((damaged[-1][0] if damaged else 0.0, f"the file is damaged from here on ({error.strerror})"))
     yield from damaged
@@ -123,8 +139,11 @@ def _luma(frame: av.VideoFrame) -> Pixels | None:
     form, plane = frame.format, frame.planes[0]
     first, *others = form.components
     packed = _PACKED.get(form.name)
-    if plane.line_size < 0:  # the last row first: the conversion turns it over
-        return frame.to_ndarray() if not others else None
+    if plane.line_size < 0:  # the last row comes first: a conversion turns that over, if it is to another format
+        if others:
+            return None
+        turned = _luma(frame.reformat(format="gray16le" if first.bits == 8 else "gray16be"))
+        return (turned >> 8).astype(np.uint8) if turned is not None and first.bits == 8 else turned
     plain = first.is_luma and not (form.has_palette or form.is_bit_stream or any(each.plane == 0 for each in others))
     if packed is None and not (plain and 8 <= first.bits <= 16):
         return None
@@ -136,4 +155,7 @@ def _luma(frame: av.VideoFrame) -> Pixels | None:
 def _rgb(frame: av.VideoFrame) -> Pixels:
     """(H, W, 3), of 16 bits where the frame has more than 8."""
     deep = any(each.bits > 8 for each in frame.format.components)
-    return frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+    if not hasattr(_conversion, "own"):
+        _conversion.own = VideoReformatter()
+    made = _conversion.own.reformat(frame, format="rgb48le" if deep else "rgb24")
+    return made.to_ndarray()

@@ -17,7 +17,8 @@ from torch_ecc.paper.result import Advance, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.curves import Circle, Ellipse, fit_circle, fit_ellipse, fit_line
 from torch_ecc.records.motion import Motion, nearest_errors
-from torch_ecc.records.synchrony import Alignment, Curve, align_records
+from torch_ecc.records.spline import Curve
+from torch_ecc.records.synchrony import Alignment, align_records
 
 RADII = (8.0, 12.0)  # um, commanded
 ZOOM = 2.0  # 0.275 um per px

@@ -58,7 +58,7 @@ def look_alikes_near(reference: Reference, image: Tensor, home: Tensor, settings
 
 def look_alikes_anywhere(locator: Locator, image: Tensor, home: Tensor) -> LookAlikes:
     """Of the one template of a ``locator`` in the whole ``image`` (1, 1, H, W) where it is at ``home`` (3,): of many
-    the nearest."""
+    the best."""
     images = image_pyramid(image, locator.levels)
-    found, _ = locator.refined(images[0], 0, locator.coarse(images, 0, home))
+    found, _ = locator.refined(images[0], 0, locator.coarse(images, 0, None))
     return LookAlikes.around(found, home, locator.pyramids[0][0].place.radius)

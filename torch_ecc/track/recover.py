@@ -19,7 +19,7 @@ from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.verdict import NOISE_SHARE, expected_score, noise_share, within_margin
+from torch_ecc.core.verdict import NOISE_SHARE, expected_score, noise_share, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import Nearby
@@ -58,6 +58,16 @@ def plausible(estimate: Estimate, start: Tensor, past: Past, radius: Tensor) -> 
     step, last = (pose_distance(start, pose, radius=radius) for pose in (estimate.pose, past.pose))
     familiar = estimate.score >= FAMILIAR * past.usual
     return Status.good(estimate.status) & familiar & (step <= BASIN + last)
+
+
+def disbelieved(estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, radius: Tensor) -> Estimate:
+    """The ``estimate`` in which those that are still suspect, and not where they are plausible, are lost."""
+    doubted = torch.tensor(suspects, device=start.device) & ~plausible(estimate, start, past, radius)
+    lost = doubted & Status.good(estimate.status)
+    return estimate._replace(
+        status=torch.where(lost, int(Status.LOST), estimate.status).to(torch.int8),
+        covariance=torch.where(lost[:, None, None], unknown(estimate.covariance), estimate.covariance),
+    )
 
 
 def familiar(found: Estimate, usual: Tensor) -> Tensor:
@@ -153,11 +163,11 @@ class Recovery:
         images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
         found, score = locator.candidates(views, 0, pose)
-        if found.status[0] != Status.CONVERGED or score[0] < FAMILIAR * past.usual[r]:
+        if found.status[0] != Status.CONVERGED:
             return estimate
         index = torch.tensor([r], device=pose.device)
         best = found.at(index.new_zeros(1))
-        if not beats(best, estimate.at(index)):
+        if not (familiar(best, past.usual[index]) & beats(best, estimate.at(index))):
             return estimate
         radius = self.reference.place.radius[r]
         distance = pose_distance(best.pose[0], pose, radius=radius)

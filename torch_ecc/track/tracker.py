@@ -23,7 +23,7 @@ from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
-from torch_ecc.track.recover import Past, Recovery, suspect
+from torch_ecc.track.recover import Past, Recovery, disbelieved, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
@@ -49,7 +49,7 @@ class Tracker(nn.Module):
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
     the frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in the frame
     it is out of view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
-    (see core.robust); False is plain least squares; ``search``: look for a template that is lost, or looks less like itself than usual, near where it
+    (``core.robust``); ``search``: look for a template that is lost, or looks less like itself than usual, near where it
     is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
     more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or "native", see
     settings.Settings.
@@ -102,10 +102,9 @@ class Tracker(nn.Module):
         self.prediction, self.search = prediction, search
         self.criterion = make_criterion(criterion, illumination)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
-        self.frame_shape = tuple(gray.shape)
+        self.frame_shape, self.levels = tuple(gray.shape), levels
         patches = locate_patches("Tracker", gray, centers, size, mask)
         _check_levels(levels, patches.size)
-        self.levels = levels
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
         none = torch.zeros_like(start[:, 0], dtype=torch.int64)
         for name, value in templates._asdict().items():
@@ -242,6 +241,7 @@ class Tracker(nn.Module):
             past = Past(*(state[name] for name in ("pose", "score", "suspect_frames", "first", "start")))
             estimate = self._recovery(images, estimate, start, past)
             suspects = suspect(estimate, state["score"])
+            estimate = disbelieved(estimate, suspects, start, past, self.references[0].place.radius)
         return self._advance_doubtful(estimate, suspects)
 
     def track(self, frame: Tensor) -> Estimate:
@@ -295,8 +295,8 @@ class Tracker(nn.Module):
             finer = self.references[level - 1], images[level - 1]
             better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
-        state = self._buffers
-        return solve(self.references[0], images[0], pose, self.settings, state["start"], state["score"])
+        start, usual = self._buffers["start"], self._buffers["score"]
+        return solve(self.references[0], images[0], pose, self.settings, start, usual)
 
     def _advance(self, estimate: Estimate) -> Estimate:
         """One frame on, in which nothing is suspect: the next state, and the ``estimate``."""
