@@ -15,7 +15,7 @@ from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.pose import pose_dtype, turn
 from torch_ecc.core.reference import MARGIN, SMALLEST, Reference, prepare
 from torch_ecc.core.sampling import pad
-from torch_ecc.core.verdict import LARGEST_SIGMA, NOISE_SHARE, largest_variance, noise_share, pose_covariance
+from torch_ecc.core.verdict import LARGEST_SIGMA, largest_variance, noise_share, pose_covariance
 
 QUANTISATION = 1 / 12  # variance of rounding to whole grey levels
 
@@ -137,5 +137,5 @@ def texture(
     covariance = pose_covariance(reference, reference.normal, variance, none + 2, turn(none))
     predicted = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     observable = largest_variance(reference, covariance) <= LARGEST_SIGMA**2
-    observable &= noise_share(reference, reference.normal, variance) <= NOISE_SHARE
+    observable &= noise_share(reference, reference.normal, variance) <= 1
     return torch.where(observable[:, None], predicted, torch.inf)

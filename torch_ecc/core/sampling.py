@@ -21,6 +21,8 @@ from torch_ecc.core.pose import pose_dtype
 MARGIN_KEPT = 3  # px: a window serves until a patch comes nearer to its border
 ROUNDING = 1e-6  # px: a pixel on the frame's outermost row is in sight, however its place was rounded
 
+FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65535.0)  # grey levels at which cameras clip
+
 Pairs = list[tuple[int, Tensor, Tensor]]  # of taps: the first one's offset, the sum of both weights, the second weight
 
 
@@ -315,12 +317,22 @@ def downsample(image: Tensor) -> Tensor:
     return blur(image, 1.0)[:, :, ::2, ::2]
 
 
+def clipped(image: Tensor) -> Tensor:
+    """Which pixels (B, 1, H, W) are as dark as can be, or as bright, and all their neighbours too."""
+    levels = image.new_tensor(FULL_SCALES)
+    top = image.amax((2, 3), keepdim=True)
+    bright = (image == top) & (top[..., None] == levels).any(-1)
+    extreme = F.pad((image <= 0) | bright, (1, 1, 1, 1), value=True).to(image.dtype)
+    return F.avg_pool2d(extreme, 3, 1) == 1
+
+
 def noise_level(image: Tensor, kept: Tensor) -> Tensor:
     """Upper estimate of the white noise of (B, 1, H, W) where ``kept`` > 0, grey levels, (B,).
 
     Median response to the difference of two Laplacians (Immerkaer, 1996), which cancels flat areas, ramps and edges
-    along rows or columns; what fine texture leaves in it counts as noise.
+    along rows or columns; what fine texture leaves in it counts as noise. Where the image is clipped there is none.
     """
+    kept = kept * ~clipped(image)
     kernel = image.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])[None, None]
     response = F.conv2d(image, kernel).abs().flatten(1) / 6
     response = torch.where(kept[:, :, 1:-1, 1:-1].flatten(1) > 0, response, float("nan"))

@@ -25,9 +25,10 @@ LEAST_COVERAGE = 0.5  # of the weight in sight must be believed: else what cover
 LEAST_INFORMATION = 0.2  # of that of all pixels in sight must be left in what is believed, in x, y and theta each
 AMBIGUITY_MARGIN = (1.5, 0.01)  # (a, b): a score s is as good as the best if 1 - s <= a (1 - s_best) + b
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
-NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps
+NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps, but
+CHANCE = 42.0  # over the square root of the number of pixels: noise as such is within so much of all of it
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
-DOUBTFUL_SHARE = 0.5  # of the information, as the likely reason why a template was not found
+DOUBTFUL_SHARE = 0.8  # of the noise that there may be, as the likely reason why a template was not found
 PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light is rounding
 
 # The tests of ``decide`` in their order, and what the first one that fails tells.
@@ -99,7 +100,7 @@ def decide(amounts: Tensor, settings: Settings) -> Tensor:
 def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Which way each amount counts, how much it has to be at least, and the status codes, (8,) each."""
     least = settings.min_visible, LEAST_COVERAGE, settings.min_score, torch.finfo(dtype).tiny
-    most = LARGEST_SIGMA**2, NOISE_SHARE, settings.tolerance
+    most = LARGEST_SIGMA**2, 1.0, settings.tolerance
     limit = torch.tensor([*least, *(-m for m in most), inf], dtype=dtype, device=device)
     sign = torch.tensor([1, 1, 1, 1, -1, -1, -1, 1], dtype=dtype, device=device)
     return sign, limit, torch.tensor(VERDICTS, dtype=torch.int8, device=device)
@@ -216,9 +217,11 @@ def largest_variance(reference: Reference, covariance: Tensor) -> Tensor:
 
 def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = None) -> Tensor:
     """The largest part (B,) of the information in any direction that the template's noise can be, whose variance is at
-    most ``variance`` (B,); infinite or NaN where the texture leaves a direction open."""
+    most ``variance`` (B,), over what it may be: the more pixels there are, the better noise is told from texture.
+    Infinite or NaN where the texture leaves a direction open."""
     power = reference.noise.power
-    return normal.noise_share * (power if variance is None else torch.minimum(power, variance))
+    most = max(NOISE_SHARE, 1 - CHANCE / reference.grid.pixels.shape[1] ** 0.5)
+    return normal.noise_share * (power if variance is None else torch.minimum(power, variance)) / most
 
 
 def unknown(covariance: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.verdict import NOISE_SHARE, expected_score, noise_share, unknown, within_margin
+from torch_ecc.core.verdict import expected_score, noise_share, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import Nearby
@@ -29,7 +29,7 @@ AT_ONCE = 8  # templates searched for in the whole of one frame; the others in t
 NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
 SELDOM = 16  # frames between two searches for what has been lost for long
-NOISE_ALONE = 0.8  # of the information in some direction: no place can be told from the next one
+NOISE_ALONE = 1.3  # times as much noise in some direction as there may be: no place can be told from the next one
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
 FEWEST_TOGETHER = 3  # templates that must have gone the same way for others to be looked for there
 TOGETHER = 3.0  # px: they have gone the same way, and more than half of those that were found have
@@ -86,8 +86,8 @@ def textureless(reference: Reference, settings: Settings) -> tuple[list[bool], l
     """Templates (B,) that most frames as noisy as themselves find LOW_TEXTURE; and those of them that no search can
     find: noise is all there is, in some direction, or so much that they would not know themselves again."""
     share, expected = noise_share(reference, reference.normal), expected_score(reference)
-    hopeless = ~(share <= NOISE_ALONE) | ((share > NOISE_SHARE) & (expected < settings.min_score))
-    return (~(share <= NOISE_SHARE)).tolist(), hopeless.tolist()
+    hopeless = ~(share <= NOISE_ALONE) | ((share > 1) & (expected < settings.min_score))
+    return (~(share <= 1)).tolist(), hopeless.tolist()
 
 
 class Recovery:
