@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
 import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -157,5 +157,5 @@ def _rgb(frame: av.VideoFrame) -> Pixels:
     deep = any(each.bits > 8 for each in frame.format.components)
     if not hasattr(_conversion, "own"):
         _conversion.own = VideoReformatter()
-    made = _conversion.own.reformat(frame, format="rgb48le" if deep else "rgb24")
+    made: av.VideoFrame = _conversion.own.reformat(frame, format="rgb48le" if deep else "rgb24")
     return made.to_ndarray()
