@@ -66,8 +66,8 @@ def test_what_covers_a_part_bends_no_pose(scene, what, share, backend):
     frames, poses = shots(scene)
     error, track = errors(noisy(covered(frames, share, what)), poses, backend=backend)
     assert (track.status == Status.CONVERGED).all()
-    assert error.abs().max() < 0.06
-    assert (track.coverage[:, 0] < 1 - 0.4 * share).all()
+    assert error.abs().max() < 0.05
+    assert share < 0.1 or (track.coverage[:, 0] < 1 - 0.5 * share).all()
     assert (track.coverage[:, 0] > 1 - share - 0.14).all()
     assert ((track.pose[:, 0] - poses[1:]).abs() < 5 * track.sigma[:, 0]).all()
 

@@ -20,7 +20,7 @@ from torch_ecc.core.reference import BLOCK, Blocks, Reference, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution, Trust
-from torch_ecc.core.verdict import correlation, expected_score, within_margin
+from torch_ecc.core.verdict import LEAST_COVERAGE, correlation, expected_score, within_margin
 
 Engine = Callable[[Reference, Tensor, Tensor, Settings, Trust | None], Solution]  # ``solver.solve``, ``native.solve``
 
@@ -36,6 +36,7 @@ SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS = 5
 CLEARLY_LESS = 0.85  # of the cost of least squares: where all edges fit worse, as by blur, leaving them out gains little
 FITS = 1.4  # median excess: nothing else is tried
+FAMILIAR = 0.9  # of the usual score: least squares that reaches it has found the template
 BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
 SETTLED = 0.01  # of the template's weight: trust changes no more
 
@@ -97,9 +98,13 @@ def solve(
             return found
         doubted, plain = doubted.at(doubtful), each(lambda value: value[doubtful], plain)
         uneven, doubtful = uneven[doubtful], doubtful[doubtful]
+    plain = plain._replace(trust=torch.ones_like(plain.sums[:, 0]))
     again, fits = solved_again(doubted, start, plain)
-    # Noise may have grown in all of the patch: then least squares is right, and leaving out most of it is not.
-    again = chosen(doubtful & (uneven | fits), again, plain._replace(trust=torch.ones_like(plain.sums[:, 0])))
+    # Noise may have grown in all of the patch, or light be another: then least squares is right, and leaving out most
+    # of it is not.
+    most = again.normal.total >= LEAST_COVERAGE * again.sums[:, 0].sum(1)
+    strange = correlation(plain.normal, plain.total) < FAMILIAR * doubted.usual
+    again = chosen(doubtful & (uneven | fits) & (most | strange), again, plain)
     found = found._replace(trust=torch.ones_like(found.sums[:, 0]))
     return each(lambda old, new: old.index_copy(0, doubted.which, new), found, again)
 
