@@ -130,7 +130,7 @@ def main() -> None:
         "speckle": (Speckle.random(), (0.0, 0.0)),
     }
     for path in sorted((data / "stills").glob("*.png")):
-        h, w = next(iter(open_frames(str(path)))).shape[-2:]
+        h, w = open_frames(path).shape
         scenes[path.stem] = image_scene(path, reflected=False), (w - 500.0, h - 500.0)
     title = f"Found (%) without search / whole frame / as shipped, {count} patches x turns of {TURNS} deg"
     table = Table("scene", "px", *(f"{n:.0f} px" for n in LENGTHS), "wrong", "ms", title=title)

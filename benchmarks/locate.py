@@ -74,7 +74,7 @@ def simulated(
 
 def parts(folder: Path) -> Iterator[Trial]:
     """Each part of rotation_full, and all of it, in every frame."""
-    facts, still = json.loads((folder / "truth.json").read_text()), next(iter(open_frames(str(folder / "ref.png"))))
+    facts, still = json.loads((folder / "truth.json").read_text()), open_frames(folder / "ref.png").first
     c = torch.tensor([*facts["centre_px"], 0.0]).double()
     for x, y, half in ((70, 52, 24), (205, 138, 30), (70, 190, 40), (98, 52, 30), (126, 126, 100)):
         local = torch.tensor([x, y, 0.0]).double() - c
@@ -82,7 +82,7 @@ def parts(folder: Path) -> Iterator[Trial]:
             turn = torch.tensor([0.0, 0.0, -math.radians(fact["theta_deg"])]).double()
             truth = compose(c, compose(turn, local))[None]
             rows, columns = slice(y - half, y + half + 1), slice(x - half, x + half + 1)
-            template, image = (image.reshape(1, 1, *image.shape[-2:]) for image in (still, frame))
+            template, image = (image.reshape(1, 1, *image.shape[-2:]) for image in (still, frame.pixels))
             yield Trial(template[..., rows, columns], image, truth)
 
 
@@ -206,7 +206,7 @@ def trials(data: Path, count: int, seed: int) -> dict[str, Iterator[Trial]]:
     }
     sets = {name: simulated(scene, count, seed) for name, scene in scenes.items()}
     for path in sorted((data / "stills").glob("*.png")):
-        h, w = next(iter(open_frames(str(path)))).shape[-2:]
+        h, w = open_frames(path).shape
         scene, spread = image_scene(path, reflected=False), (w - 500.0, h - 500.0)
         sets[path.stem] = simulated(scene, max(count // 2, 1), seed, spread=spread, noise=2.0)
     return {**sets, "rotation_full": parts(data / "rotation_full")}

@@ -28,11 +28,11 @@ def facts(folder: Path) -> dict:
 
 
 def frames(folder: Path) -> list[torch.Tensor]:
-    return list(open_frames(str(folder / "f*.png")))
+    return [frame.pixels for frame in open_frames(str(folder / "f*.png"))]
 
 
 def reference(folder: Path) -> torch.Tensor:
-    return next(iter(open_frames(str(folder / "ref.png"))))
+    return open_frames(folder / "ref.png").first
 
 
 def middle(hint: list[int]) -> tuple[float, float]:

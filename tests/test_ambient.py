@@ -252,3 +252,25 @@ def test_autocast_goes_on_behind_a_door() -> None:
         with pytest.raises(ValueError, match="closed"):
             door(True)
         assert (square @ square).dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("wanted", [1, 2])
+def test_the_number_of_threads_is_the_callers(wanted):
+    """A frame is tracked on as many as it is worth, and its caller's number is there again, whatever happens."""
+    seen, before = [], torch.get_num_threads()
+
+    def fails() -> None:
+        with ambient.threads_for(100):
+            seen.append(torch.get_num_threads())
+            raise KeyError
+
+    torch.set_num_threads(wanted)
+    try:
+        with pytest.raises(KeyError):
+            fails()
+        seen.append(torch.get_num_threads())
+        with ambient.threads_for(ambient.PIXELS_PER_THREAD):
+            seen.append(torch.get_num_threads())
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1, wanted, wanted]

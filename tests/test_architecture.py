@@ -85,6 +85,19 @@ def test_import_is_light():
     assert out.stdout.strip() == "[]"
 
 
+def test_names_come_when_they_are_used():
+    """Not even torch is there before; kornia, slower than all the rest together, not with the names either."""
+    code = (
+        "import sys, torch_ecc; before = 'torch' in sys.modules; [getattr(torch_ecc, n) for n in torch_ecc.__all__];"
+        "print(before, 'torch' in sys.modules, 'kornia' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["False", "True", "False"]
+    assert set(torch_ecc.__all__) <= set(dir(torch_ecc))
+    with pytest.raises(AttributeError, match="module 'torch_ecc' has no attribute 'trakcer'"):
+        _ = torch_ecc.trakcer
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_files_and_functions_stay_small(path):
     text = path.read_text()

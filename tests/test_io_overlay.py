@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +17,8 @@ from torch import Tensor
 
 from torch_ecc.core.pose import transform
 from torch_ecc.io import OverlayWriter, open_frames
+from torch_ecc.io.beside import ahead
+from torch_ecc.io.marks import Mark
 from torch_ecc.io.shapes import outlines
 
 GREY = torch.full((480, 640), 90, dtype=torch.uint8)
@@ -25,7 +30,7 @@ def found_at(*poses: tuple[float, float, float], status: tuple[int, ...] = ()) -
     codes = torch.tensor(status or (0,) * count, dtype=torch.int8)
     score = torch.full((count,), 0.987)
     covariance = torch.eye(3).expand(count, 3, 3)
-    return Report(pose, pose - pose[0], score, codes, torch.full((count,), 4), covariance, score)
+    return Report(pose, pose - pose[0], score, codes, torch.full((count,), 4), covariance, score, score)
 
 
 def drawn(folder: Path, frame: Tensor, *records: Report, shapes=((121, 161),)) -> np.ndarray:
@@ -35,7 +40,7 @@ def drawn(folder: Path, frame: Tensor, *records: Report, shapes=((121, 161),)) -
             writer.write(frame, record)
     assert writer.path == folder / "overlay"
     *_, last = open_frames(folder / "overlay")
-    return last.permute(1, 2, 0).numpy().astype(int)
+    return last.picture().permute(1, 2, 0).numpy().astype(int)
 
 
 def coloured(picture: np.ndarray) -> np.ndarray:
@@ -161,7 +166,7 @@ def test_deep_frames_are_stretched_by_the_first_one(tmp_path):
         writer.write(ramp, record)
         writer.write(ramp / 2, record)
     _, second = open_frames(tmp_path / "two" / "overlay")
-    np.testing.assert_allclose(second[0, 20], wanted / 2, atol=2)
+    np.testing.assert_allclose(second.picture()[0, 20], wanted / 2, atol=2)
 
 
 def test_8_bit_frames_stay_as_they_are(tmp_path):
@@ -184,7 +189,7 @@ def test_video(tmp_path, size, fps):
     with OverlayWriter(tmp_path, shapes=[(121, 161)], status_names=NAMES, fps=fps) as writer:
         for k in range(6):
             writer.write(frame, found_at((320.0 + k, 240.0, 0.0)))
-            assert names(tmp_path) == {"overlay.part.mp4"}
+            assert names(tmp_path) <= {"overlay.h264.part"}
     assert names(tmp_path) == {"overlay.mp4"}
     assert writer.path == tmp_path / "overlay.mp4"
     source = open_frames(writer.path)
@@ -193,16 +198,70 @@ def test_video(tmp_path, size, fps):
     assert source.fps == pytest.approx({None: 25.0, 0.01: 0.1, 1234.567: 1000.0}.get(fps, fps))
 
 
+def test_browsers_play_the_video(tmp_path):
+    """H.264 of 8 bits with halved chroma, its index at the front, key pictures to jump to, and every picture there."""
+    with OverlayWriter(tmp_path, shapes=[(121, 161)], status_names=NAMES, fps=50.0) as writer:
+        for k in range(120):
+            writer.write(GREY, found_at((320.0 + k, 240.0, 0.0)))
+    with av.open(str(writer.path)) as film:
+        stream = film.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt, stream.frames) == ("h264", "yuv420p", 120)
+        packets = [packet for packet in film.demux(stream) if packet.size]
+        assert [packet.pts * packet.time_base for packet in packets] == [Fraction(k, 50) for k in range(120)]
+        assert max(np.diff([k for k, packet in enumerate(packets) if packet.is_keyframe])) <= 50
+    data = writer.path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")
+
+
+def test_micrometres_are_in_the_label(tmp_path):
+    """Where the scale is known: one line more."""
+    heights = []
+    for um in (None, torch.diag(torch.tensor([0.3, -0.3]))):
+        folder = tmp_path / str(um is None)
+        with OverlayWriter(folder, shapes=[(121, 161)], status_names=NAMES, um_matrix=um, as_frames=True) as writer:
+            writer.write(GREY, found_at((320.0, 300.0, 0.0)))
+        (picture,) = (frame.picture() for frame in open_frames(folder / "overlay"))
+        heights.append(int((picture.amax(0)[100:235, 245:440] < 60).any(1).sum()))
+    assert heights[1] > 1.3 * heights[0]
+    mark = Mark(0, np.zeros(3), np.eye(2, 3), 1.0, "CONVERGED", [], [], np.array([1.25, -0.5]))
+    assert "Δx +1.250 µm   Δy -0.500 µm" in mark.text("above")
+
+
+def test_what_fails_behind_is_told(tmp_path, monkeypatch):
+    """Pictures are written on another thread: an error there ends the run here, soon."""
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("torch_ecc.io.sinks.append", full)
+
+    def run() -> None:
+        with OverlayWriter(tmp_path, shapes=[(121, 161)], status_names=NAMES) as writer:
+            for k in range(100):
+                writer.write(GREY, found_at((320.0 + k, 240.0, 0.0)))
+
+    with pytest.raises(OSError, match="No space left"):
+        run()
+    assert "overlay.mp4" not in names(tmp_path)
+
+
+def test_reading_ahead_keeps_order_and_errors():
+    def items() -> Iterator[int]:
+        yield from range(100)
+        raise ValueError("the end")
+
+    seen = []
+    with pytest.raises(ValueError, match="the end"):  # noqa: PT012
+        for item in ahead(items()):
+            seen.append(item)  # noqa: PERF402
+    assert seen == list(range(100))
+    stream = ahead(iter(range(10**9)))
+    assert next(stream) == 0
+    stream.close()
+
+
 def test_frames_where_no_video_can_be_written(tmp_path, monkeypatch):
-    class NoCodec:
-        fourcc = cv2.VideoWriter.fourcc
-
-        def __init__(self, *_: object) -> None: ...
-
-        def isOpened(self) -> bool:
-            return False
-
-    monkeypatch.setattr(cv2, "VideoWriter", NoCodec)
+    monkeypatch.setattr(av, "codecs_available", {"png"})
     with OverlayWriter(tmp_path, shapes=[(121, 161)], status_names=NAMES) as writer:
         writer.write(GREY, found_at((320.0, 240.0, 0.0)))
     assert writer.path == tmp_path / "overlay"

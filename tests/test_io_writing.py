@@ -33,6 +33,7 @@ class Report(NamedTuple):
     iterations: Tensor
     covariance: Tensor
     residual_rms: Tensor
+    coverage: Tensor
 
 
 def report(seed: int = 0, templates: int = 2, *, lost: tuple[int, ...] = ()) -> Report:
@@ -45,7 +46,9 @@ def report(seed: int = 0, templates: int = 2, *, lost: tuple[int, ...] = ()) -> 
         status[index] = 2
         covariance[index] = torch.diag(torch.full((3,), math.inf, dtype=torch.float64))
     score = torch.rand(templates, generator=generator)
-    return Report(displacement + 100, displacement, score, status, torch.full((templates,), 4), covariance, 3 * score)
+    return Report(
+        displacement + 100, displacement, score, status, torch.full((templates,), 4), covariance, 3 * score, score
+    )
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -97,7 +100,7 @@ def check_rows(table: list[dict[str, str]], track: dict[str, np.ndarray], fps: f
     assert [(int(row["frame"]), int(row["template"])) for row in table] == list(np.ndindex(frames, templates))
     for row in table:
         at = int(row["frame"]), int(row["template"])
-        found = {name: float(value) for name, value in row.items() if name != "status"}
+        found = {name: float(value) for name, value in row.items() if name not in ("status", "damage")}
         pose = [found[name] for name in ("x_px", "y_px", "theta_rad")]
         moved = [found[name] for name in ("dx_px", "dy_px", "dtheta_rad")]
         sigma = [found[name] for name in ("sigma_x_px", "sigma_y_px", "sigma_theta_rad")]
@@ -106,6 +109,7 @@ def check_rows(table: list[dict[str, str]], track: dict[str, np.ndarray], fps: f
         np.testing.assert_allclose(sigma, np.sqrt(np.diag(track["covariance"][at])), rtol=1e-3)
         assert found["score"] == pytest.approx(track["score"][at], abs=1e-6)
         assert found["residual_rms"] == pytest.approx(track["residual_rms"][at], rel=1e-3)
+        assert found["coverage"] == pytest.approx(track["coverage"][at], abs=1e-3)
         assert found["iterations"] == track["iterations"][at]
         assert row["status"] == NAMES[track["status"][at]]
         assert ("time_s" in row) == (fps is not None)
@@ -120,7 +124,7 @@ def test_columns_carry_their_units(tmp_path):
         writer.write(report())
     assert (tmp_path / "track.csv").read_text().splitlines()[0] == (
         "frame,template,time_s,x_px,y_px,theta_rad,dx_px,dy_px,dtheta_rad,dx_um,dy_um,"
-        "sigma_x_px,sigma_y_px,sigma_theta_rad,score,status,iterations,residual_rms"
+        "sigma_x_px,sigma_y_px,sigma_theta_rad,score,status,iterations,residual_rms,coverage,damage"
     )
 
 
@@ -207,8 +211,8 @@ def test_interrupt_in_the_middle_of_a_frame(tmp_path, monkeypatch, frames):
         with pytest.raises(KeyboardInterrupt):
             writer.write(report(9))
         if frames:
-            writer._files._records.write(b"half a record")
-            writer._files._csv.write(b"3,0,half a r")
+            writer._journal.records_file.write(b"half a record")
+            writer._journal.table_file.write(b"3,0,half a r")
     if not frames:
         assert names(tmp_path) == set()
         return

@@ -223,7 +223,7 @@ def test_where_many_jump_the_others_are_found_by_the_motion_of_some(data, last):
     """200 patches of 31 px of a speckled plate, beyond the reach of the search near."""
     folder = data / "pyvale_rigid"
     truth = json.loads((folder / "truth.json").read_text())["frames"][last]
-    first, second = (next(iter(open_frames(str(folder / name)))) for name in ("ref.png", f"f{last:03d}.png"))
+    first, second = (open_frames(folder / name).first for name in ("ref.png", f"f{last:03d}.png"))
     corner, span = torch.tensor([20.0, 80.0]), torch.tensor([149.0, 299.0])
     centers = corner + span * torch.rand(200, 2, generator=torch.Generator().manual_seed(0))
     estimate = Tracker(first, centers, 31)(second)

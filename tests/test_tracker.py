@@ -235,11 +235,26 @@ def test_a_sequence_error_keeps_the_track_so_far():
     with pytest.raises(
         SequenceError, match=r"frame 6: track: frame must be 1 image of 240x200 px as the first"
     ) as caught:
-        Tracker(stack[0], CENTERS, 51).track_sequence(stack[1:])
+        Tracker(stack[0], CENTERS, 51).track_sequence(stack[1:], stop_at_damage=True)
     assert caught.value.track.pose.shape == (6, 3, 3)
     with pytest.raises(SequenceError) as caught:
-        Tracker(stack[0], CENTERS, 51).track_sequence(stack[7:])
+        Tracker(stack[0], CENTERS, 51).track_sequence([stack[1].numpy(), stack[2]])
     assert caught.value.track is None
+
+
+@once
+def test_a_sequence_goes_on_after_damage():
+    """Missing, cropped, not finite: each its status, the last good pose, and neighbours as if nothing had been."""
+    stack = list(frames(PATH))[:9]
+    wanted = Tracker(stack[0], CENTERS, 51).track_sequence(stack)
+    damaged = [*stack[:2], None, stack[3], stack[4][:-1], stack[5] * torch.nan, *stack[6:]]
+    track = Tracker(stack[0], CENTERS, 51).track_sequence(damaged)
+    bad = torch.tensor([False, False, True, False, True, True, False, False, False])
+    assert ((track.status == Status.DAMAGED) == bad[:, None]).all()
+    assert track.covariance[bad].diagonal(dim1=-2, dim2=-1).isinf().all()
+    assert all(value.dtype == other.dtype for value, other in zip(track, wanted, strict=True))
+    assert torch.equal(track.pose[2], track.pose[1])
+    assert (track.pose - wanted.pose)[~bad].abs().max() < 2e-3
 
 
 def test_everything_moves_to_a_device(device):

@@ -1,21 +1,41 @@
 """Planar pose tracking (x, y, theta) of textured patches, to a thousandth of a pixel, with an honest uncertainty.
 
 ``Tracker`` follows patches through a video; ``prepare`` and ``align`` are the pure functions under it; ``locate``
-finds a patch anywhere, at any angle; ``texture`` judges it beforehand; ``Calibration`` turns pixels into micrometres.
-Conventions: see ``torch_ecc.pose``.
+finds a patch anywhere, at any angle; ``texture`` judges it beforehand; ``stabilise`` warps frames back onto the first;
+``Calibration`` turns pixels into micrometres. Conventions: see ``torch_ecc.pose``.
+
+Names are fetched when they are first used: ``import torch_ecc`` alone does not even bring torch.
 """
 
-from torch_ecc.core import pose
-from torch_ecc.core.align import align
-from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
-from torch_ecc.core.estimate import Estimate, Origin, Status, Track
-from torch_ecc.core.patches import texture
-from torch_ecc.core.reference import Reference, prepare
-from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
-from torch_ecc.search.locate import Located, Locator, locate
-from torch_ecc.track.tracker import SequenceError, Tracker
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what type checkers and editors read; the same places as below
+    from torch_ecc.core import pose
+    from torch_ecc.core.align import align
+    from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
+    from torch_ecc.core.estimate import Estimate, Origin, Status, Track
+    from torch_ecc.core.patches import texture
+    from torch_ecc.core.reference import Reference, prepare
+    from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
+    from torch_ecc.search.locate import Located, Locator, locate
+    from torch_ecc.track.stabilise import stabilise
+    from torch_ecc.track.tracker import SequenceError, Tracker
 
 __version__ = "0.1.0"
+
+_PLACES = {
+    "core.pose": ["pose"],
+    "core.align": ["align"],
+    "core.criteria": ["ECC", "SSD", "Criterion", "PaperECC"],
+    "core.estimate": ["Estimate", "Origin", "Status", "Track"],
+    "core.patches": ["texture"],
+    "core.reference": ["Reference", "prepare"],
+    "records.calibration": ["Calibration", "CalibrationFit", "calibrate"],
+    "search.locate": ["Located", "Locator", "locate"],
+    "track.stabilise": ["stabilise"],
+    "track.tracker": ["SequenceError", "Tracker"],
+}
 
 __all__ = [
     "ECC",
@@ -38,5 +58,19 @@ __all__ = [
     "locate",
     "pose",
     "prepare",
+    "stabilise",
     "texture",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    for place, names in _PLACES.items():
+        if name in names:
+            module = import_module(f"torch_ecc.{place}")
+            globals()[name] = value = module if name == "pose" else getattr(module, name)
+            return value
+    raise AttributeError(f"module 'torch_ecc' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

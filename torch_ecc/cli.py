@@ -15,7 +15,7 @@ from rich.progress import Task as RichTask
 from rich.text import Text
 
 from torch_ecc.commands.jobs import Align, CompareJob, TrackJob
-from torch_ecc.commands.options import given, options_of, read_polygons, read_size, track_toml, write_new
+from torch_ecc.commands.options import given, options_of, read_polygons, read_scale, read_size, track_toml, write_new
 from torch_ecc.config import fill, read_toml
 
 INTERRUPTED = 130
@@ -37,7 +37,7 @@ def demo(out: str, frames: int) -> None:
     from torch_ecc.commands.demo import run_demo
 
     with progress_bar("demo") as advance:
-        result = run_demo(Path(out), frames, advance)
+        result = run_demo(Path(out).expanduser(), frames, advance)
     console.print(result.table())
     console.print(f"In {out}/: demo.png, and track.png, overlay.mp4, track.csv ... of each method in ecc/ and ssd/")
 
@@ -56,7 +56,8 @@ def demo(out: str, frames: int) -> None:
     TrackJob,
     without=("input",),
     centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
-    size={"type": str, "metavar": "N|WxH", "callback": read_size},
+    size={"type": str, "metavar": "N|H,W", "callback": read_size},
+    um_per_px={"type": str, "metavar": "S|SX,SY", "callback": read_scale},
     polygons={
         "flag": "--polygon",
         "type": str,
@@ -80,8 +81,10 @@ def track(config: str | None, write_config: str | None, **options: Any) -> None:
     from torch_ecc.commands.track import Session
 
     session = Session(fill(TrackJob, values, config or "track"))
+    for remark in session.remarks():
+        console.print(remark, soft_wrap=True, markup=False)
     with progress_bar(session.source.name, session.source.length) as advance:
-        finished = session.run(lambda estimate: advance())
+        finished = session.run(advance)
     _report(finished)
     if finished.interrupted:
         sys.exit(INTERRUPTED)
@@ -97,14 +100,14 @@ def simulate(config: str, out: str) -> None:
     """
     from torch_ecc.sim import from_config, save
 
-    simulation = from_config(read_toml(config), folder=Path(config).parent)
+    simulation = from_config(read_toml(config), folder=Path(config).expanduser().parent)
     sequence, template = simulation.sequence, simulation.template
     with progress_bar("simulate", len(sequence)) as advance:
-        save(sequence, out, metadata=simulation.metadata, progress=advance)
+        save(sequence, Path(out).expanduser(), metadata=simulation.metadata, progress=advance)
     x, y = template.center or (0.0, 0.0)
     h, w = template.size
     console.print(f"{len(sequence)} frames in {out}/. To track them:")
-    console.print(f"  torch-ecc track {out}/frames --center {x:g} {y:g} --size {w}x{h}", soft_wrap=True)
+    console.print(f"  torch-ecc track {out}/frames --center {x:g} {y:g} --size {h},{w}", soft_wrap=True)
 
 
 @app.command()
@@ -121,7 +124,7 @@ def reproduce(names: tuple[str, ...], quick: bool, out: str) -> None:
     try:
         for name in chosen(names):
             with progress_bar(name, unit="steps") as advance:
-                outcome = run(name, out, quick, advance)
+                outcome = run(name, Path(out).expanduser(), quick, advance)
             _say_numbers(outcome)
     except KeyboardInterrupt:
         console.print(f"Stopped from the keyboard. What was finished before is in {out}/", soft_wrap=True)
@@ -173,7 +176,9 @@ def servo(config: str, **options: Any) -> None:
     from torch_ecc.commands.servo_job import ServoJob
 
     values = read_toml(config)
-    job = ServoJob.read(values | {"align": values.get("align", {}) | given(options)}, folder=Path(config).parent)
+    job = ServoJob.read(
+        values | {"align": values.get("align", {}) | given(options)}, folder=Path(config).expanduser().parent
+    )
     with Console(stderr=True).status("teaching the templates") as live:
         run = run_session(job, lambda part, step: live.update(f"{part}  {step}"))
     for line in describe(job, run):
@@ -192,9 +197,17 @@ def _report(finished: Any) -> None:
             console.print(
                 f"Template {number} was not found in {lost} of {finished.frames} frames. Last frame: {sentence}"
             )
-    end = "Stopped from the keyboard after" if finished.interrupted else "Tracked"
-    names = ", ".join(sorted(path.name for path in finished.folder.iterdir())) if finished.frames else "nothing"
-    console.print(f"{end} {finished.frames} frames. In {finished.folder}/: {names}")
+    if finished.damaged:
+        console.print(f"{finished.damaged} of {finished.frames} frames are damaged: track.csv says which and why")
+    end = "Stopped after" if finished.interrupted else "Tracked"
+    names = (
+        ", ".join(sorted(path.name for path in finished.folder.iterdir() if path.suffix != ".part"))
+        if finished.frames
+        else "nothing"
+    )
+    console.print(f"{end} {finished.frames} frames. In {finished.folder}/: {names}", soft_wrap=True, markup=False)
+    if finished.interrupted and finished.frames:
+        console.print("The same command with --resume goes on from there.")
 
 
 class _Rate(ProgressColumn):
@@ -232,6 +245,13 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt):
         Console(stderr=True).print("torch-ecc: stopped from the keyboard", style="red")
         sys.exit(INTERRUPTED)
-    except (ValueError, OSError) as error:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"torch-ecc: {error}", style="red", markup=False)
+    except (ValueError, OSError, MemoryError) as error:
+        Console(stderr=True, highlight=False, soft_wrap=True).print(
+            f"torch-ecc: {one_line(error)}", style="red", markup=False
+        )
         sys.exit(2)
+
+
+def one_line(error: BaseException) -> str:
+    """The words of an error with line ends and control codes, which names of files may hold, as escapes."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(error).strip())

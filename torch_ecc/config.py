@@ -27,12 +27,14 @@ UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}  # pydantic's names
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """The tables of a TOML file. FileNotFoundError if it is missing, ValueError with the line if it is malformed."""
-    path = Path(path)
+    path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"config: no such file: {path}")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise ValueError(f"config: {path} is not valid TOML: it is nested too deeply") from error
+    except ValueError as error:  # also for bytes that are no text, and numbers of thousands of digits
         raise ValueError(f"config: {path} is not valid TOML: {error}") from error
 
 

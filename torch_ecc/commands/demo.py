@@ -97,7 +97,7 @@ def _open(stack: ExitStack, folder: Path, tracker: Tracker) -> tuple[TrackWriter
     um = Calibration(UM_PER_PX).matrix(torch.zeros(1, dtype=torch.float64))[:2, :2]
     settings = {"criterion": str(tracker.criterion), "size": SIZE, "um_per_px": UM_PER_PX, **asdict(tracker.settings)}
     track = TrackWriter(folder, status_names=STATUS_NAMES, fps=25.0, um_matrix=um, settings=settings)
-    overlay = OverlayWriter(folder, shapes=[(SIZE, SIZE)], status_names=STATUS_NAMES, fps=25.0)
+    overlay = OverlayWriter(folder, shapes=[(SIZE, SIZE)], status_names=STATUS_NAMES, fps=25.0, um_matrix=um)
     return stack.enter_context(track), stack.enter_context(overlay)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field, fields
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 from torch_ecc.core.criteria import CRITERIA, ILLUMINATION
@@ -47,13 +49,14 @@ class TrackJob(Tracking):
     centers: tuple[Point, ...] = described(
         (), "centre of each template, px: x to the right, y down, pixel centres at integers", example=((320.0, 240.0),)
     )
-    size: int | tuple[int, int] | None = described(
-        None, "side of the templates, px; in a file also [height, width]", example=121
-    )
+    size: int | tuple[int, int] | None = described(None, "side of the templates, px, or height and width", example=121)
     polygons: tuple[tuple[Point, ...], ...] = described(
         (),
         "outline of each template, frame px, instead of a square or within it",
         example=(((314, 213), (340, 186), (364, 193), (364, 228), (352, 241)),),
+    )
+    grid: int | None = described(
+        None, "this many templates of that size in a row, and rows to match, where there is texture", example=8
     )
     reference: str | None = described(
         None, "image to cut the templates from; without it, the first frame of the input", example="first.png"
@@ -63,27 +66,54 @@ class TrackJob(Tracking):
         "image of each template, instead of size: found anywhere, at any angle, nearest to its centre if given",
         example=("crop.png",),
     )
-    out: str = described("torch-ecc-out", "folder for track.csv, track.npz, track.png, summary.json and overlay.mp4")
-    overlay: bool = described(True, "write overlay.mp4")
-    um_per_px: float | Point | None = described(
-        None,
-        "scale of the camera, adds micrometres; in a file also [x, y], negative against a stage's axis",
-        example=0.35,
+    frames: str | None = described(
+        None, "FIRST:LAST:STEP, numbers of frames from 0, both ends included, each may be left out", example="100:500:2"
     )
+    channel: int | None = described(None, "which one of a file's channels, from 0", example=0)
+    slice: int | None = described(None, "which one of its slices (depths)", example=0)
+    position: int | None = described(None, "which one of its stage positions", example=0)
+    out: str | None = described(
+        None, "folder for the results; without it, one here, named after the input", example="results"
+    )
+    force: bool = described(False, "replace the results that the folder holds")
+    resume: bool = described(False, "go on where a run in this folder was stopped, killed, or out of disk space")
+    stop_at_damage: bool = described(False, "end at the first damaged frame, instead of going on with the next one")
+    overlay: bool = described(True, "write overlay.mp4")
+    stabilise: int | None = described(
+        None, "write stabilised.mp4, in which this template, counted from 0, stands still", example=0
+    )
+    um_per_px: float | Point | None = described(
+        None, "scale of the camera, or that of x and of y; without it, the file's own if it has one", example=0.35
+    )
+    flip_y: bool = described(False, "the stage counts y upwards: turns the sign of dy_um")
     axis_angle_deg: float = described(0.0, "from the camera's axes to the stage's")
     fps: float | None = described(
-        None, "frames per second, adds times; without it, the video's own if it has one", example=100.0
+        None, "frames per second, instead of the times of the file's own frames", example=100.0
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_rate(self.fps)
+        span(self.frames)
 
-    def calibration(self) -> Calibration | None:
-        """Pixels to micrometres, None if the scale is not given."""
-        if self.um_per_px is None:
+    def calibration(self, of_file: Point | None = None) -> Calibration | None:
+        """Pixels to micrometres, None if neither the job nor the file tells the scale."""
+        scale = self.um_per_px if self.um_per_px is not None else of_file
+        if scale is None:
+            if self.flip_y:
+                raise ValueError("flip_y: expected with um_per_px, which the file does not tell: it is of micrometres")
             return None
-        return Calibration(self.um_per_px, math.radians(self.axis_angle_deg))
+        x, y = Calibration(scale).scales
+        return Calibration((x, -y if self.flip_y else y), math.radians(self.axis_angle_deg))
+
+    def folder(self) -> Path:
+        """Where the results go."""
+        if self.out is not None:
+            return Path(self.out).expanduser()
+        given = Path(self.input.strip()).expanduser()
+        told = given.resolve().name if given.is_dir() else given.stem
+        plain = re.sub(r"[^\w.-]+", "-", told).strip("-.") or given.parent.name or "frames"
+        return Path(f"camera-{plain}-track" if plain.isdecimal() and not given.exists() else f"{plain}-track")
 
 
 @dataclass(frozen=True)
@@ -127,6 +157,20 @@ class Align:
     size: int = 121
     out: str = described("torch-ecc-servo", "folder for the outputs")
     overlay: bool = described(True, "write overlay.mp4")
+
+
+def span(frames: str | None) -> slice:
+    """The frames that FIRST:LAST:STEP means, LAST included. ValueError if it is something else."""
+    parts = (frames or "").split(":")
+    try:
+        first, last, step = (int(part) if part.strip() else None for part in [*parts, "", ""][:3])
+    except ValueError:
+        parts = ["", "", "", ""]
+    if len(parts) > 3 or (first or 0) < 0 or (last or 0) < 0 or (step is not None and step < 1):
+        raise ValueError(f"frames: expected FIRST:LAST:STEP, whole numbers from 0 on, got {frames!r}")
+    if len(parts) == 1 and first is not None:
+        last = first
+    return slice(first, None if last is None else last + 1, step)
 
 
 def _check_rate(hz: float | None, name: str = "fps") -> None:

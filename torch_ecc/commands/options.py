@@ -68,14 +68,27 @@ def given(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_size(context: click.Context, option: click.Parameter, text: str | None) -> int | list[int] | None:
-    """N or WxH as a number or [h, w]."""
+    """N or H,W as a number or [h, w]: heights come first wherever sizes are given."""
     if text is None:
         return None
-    parts = text.lower().split("x")
+    parts = text.split(",")
     if not (1 <= len(parts) <= 2 and all(part.strip().isdecimal() for part in parts)):
-        raise ValueError(f"size: expected a number of px or WxH, got {text!r}")
+        raise ValueError(f"size: expected a number of px or HEIGHT,WIDTH, got {text!r}")
     numbers = [int(part) for part in parts]
-    return numbers[0] if len(numbers) == 1 else numbers[::-1]
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def read_scale(context: click.Context, option: click.Parameter, text: str | None) -> float | list[float] | None:
+    """S or SX,SY as a number or [x, y]."""
+    if text is None:
+        return None
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 2:
+        raise ValueError(f"um_per_px: expected one number or two as SX,SY, got {text!r}")
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def read_polygons(context: click.Context, option: click.Parameter, texts: tuple[str, ...]) -> list[list[list[float]]]:
@@ -106,9 +119,10 @@ def track_toml(values: Mapping[str, Any], where: str = "track") -> str:
 
 def write_new(text: str, file: str) -> None:
     """Write a text into a new file, or on the screen if that is "-". ValueError if there is such a file."""
+    path = Path(file).expanduser()
     if file == "-":
         click.echo(text, nl=False)
-    elif Path(file).exists():
+    elif path.exists():
         raise ValueError(f"write-config: {file} is already there and was left as it is")
     else:
-        Path(file).write_text(text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")

@@ -3,56 +3,47 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable
-from contextlib import nullcontext
-from itertools import chain
+import errno
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self, TypeAlias
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_ecc.commands.jobs import TrackJob
-from torch_ecc.core.estimate import Estimate, Status
-from torch_ecc.core.frame import as_gray
-from torch_ecc.io import OverlayWriter, TrackWriter, open_frames
-from torch_ecc.plots import plot_track
-from torch_ecc.search.locate import Located
+from torch_ecc.commands.jobs import TrackJob, span
+from torch_ecc.commands.templates import Templates, choose_templates, read_templates, refuse_doubt
+from torch_ecc.core.ambient import threads_for
+from torch_ecc.core.estimate import Status
+from torch_ecc.io import Frame, OverlayWriter, TrackWriter, open_frames
+from torch_ecc.io.beside import ahead
+from torch_ecc.io.journal import Unfinished
+from torch_ecc.io.output import check_folder, claim
+from torch_ecc.io.stabilised import StabilisedWriter
+from torch_ecc.io.summary import plain
+from torch_ecc.io.track import FILES
 from torch_ecc.track.tracker import Tracker
 
+Pictures: TypeAlias = OverlayWriter | StabilisedWriter
+
 STATUS_NAMES = {int(code): code.name for code in Status}
-
-
-class Templates(NamedTuple):
-    """Centres (R, 2) px, common size (h, w) px and masks (R, h, w) or None."""
-
-    centers: Tensor
-    size: tuple[int, int]
-    mask: Tensor | None
-
-    @staticmethod
-    def of(crops: Tensor) -> Templates:
-        """The templates that images (R, 1, h, w) show, each in its own coordinates."""
-        h, w = crops.shape[-2:]
-        return Templates(torch.tensor([[(w - 1) / 2, (h - 1) / 2]]).repeat(len(crops), 1), (h, w), None)
-
-    @property
-    def shapes(self) -> list[tuple[int, int] | Tensor]:
-        """What each template covers, for drawing."""
-        return [self.size] * len(self.centers) if self.mask is None else list(self.mask)
+RESULTS = (*FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
+NOT_OF_THE_RESULT = ("out", "force", "resume")
+CONSTANT = ("template", "mask", "centre", "first")  # of a tracker's state
 
 
 class Finished(NamedTuple):
-    """What became of a run: ``frames`` done, how many each template was lost in and its last status (R,), the folder,
-    and whether it was stopped from the keyboard."""
+    """What became of a run: ``frames`` done, of which so many ``damaged``, how many each template was lost in of the
+    others and its last status (R,), the folder, and whether it was stopped from the keyboard or by a signal."""
 
     frames: int
-    lost: Tensor
-    last_status: Tensor
+    damaged: int
+    lost: NDArray[np.int64]
+    last_status: NDArray[np.int8]
     folder: Path
     interrupted: bool
 
@@ -64,140 +55,226 @@ class Session:
     """
 
     def __init__(self, job: TrackJob) -> None:
-        self.job, self.calibration = job, job.calibration()
+        self.job, self.folder = job, check_folder(job.folder(), "track")
+        if not (job.force or (job.resume and Unfinished.of(self.folder))):
+            refuse_overwriting(self.folder, RESULTS)
         crops = read_templates(job)
-        self.templates = choose_templates(job) if crops is None else Templates.of(crops)
-        self.source = open_frames(job.input)
-        frames = iter(self.source)
-        first = next(frames) if job.reference is None else next(iter(open_frames(job.reference)))
-        self.frames = frames if job.reference else chain((first,), frames)
-        centers, size, mask = self.templates
-        if crops is None:
-            self.tracker = Tracker(first, centers, size, mask=mask, **job.options())
-        else:
-            near = torch.tensor(job.centers).double() if job.centers else None
-            self.tracker, located = Tracker.find(crops, first, near=near, **job.options())
-            refuse_doubt(located, near is not None)
+        choice = {name: getattr(job, name) for name in ("channel", "slice", "position")}
+        self.source = open_frames(job.input, fps=job.fps, **choice)
+        if job.frames is not None:
+            self.source = self.source[span(job.frames)]
+        first = self.source.first if job.reference is None else open_frames(job.reference).first
         if self.source.shape != first.shape[-2:]:
             (h, w), (h0, w0) = self.source.shape, first.shape[-2:]
             raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
-        self.fps = job.fps if job.fps is not None else self.source.fps
+        self.templates = choose_templates(job, first) if crops is None else Templates.of(crops)
+        self.calibration = job.calibration(self.source.um_per_px)
+        centers, size, mask = self.templates
+        if job.stabilise is not None and not 0 <= job.stabilise < len(centers):
+            raise ValueError(f"stabilise: expected a template from 0 to {len(centers) - 1}, got {job.stabilise}")
+        with threads_for(len(centers) * size[0] * size[1]):
+            if crops is None:
+                self.tracker = Tracker(first, centers, size, mask=mask, **job.options())
+            else:
+                near = torch.tensor(job.centers).double() if job.centers else None
+                self.tracker, located = Tracker.find(crops, first, near=near, **job.options())
+                refuse_doubt(located, near is not None)
+        self.settings = settings_of(job, first)
 
-    def run(self, progress: Callable[[Estimate], None] = lambda estimate: None) -> Finished:
-        """Track every frame and write DIR/track.csv, track.npz, track.png, summary.json and overlay.mp4.
+    def remarks(self) -> list[str]:
+        """What people should know before: what was taken from the file, and what is strange about it."""
+        remarks = list(self.source.notes)
+        if self.job.fps is None and self.source.fps is not None:
+            remarks.append(f"{self.source.fps:.6g} frames per second, as the file says")
+        if self.job.um_per_px is None and self.calibration is not None:
+            x, y = self.calibration.scales
+            remarks.append(f"{x:.6g} um per px{'' if abs(y) == x else f' in x, {abs(y):.6g} in y'}, as the file says")
+        if self.job.grid is not None:
+            remarks.append(f"{len(self.templates.centers)} templates where there is texture enough")
+        return remarks
 
-        ``progress`` is told each frame's estimate. Ctrl-C ends the run and keeps what it had; so does a damaged frame,
-        whose ValueError is raised again once everything before it is written.
+    def run(self, progress: Callable[[int], None] = lambda done: None) -> Finished:
+        """Track every frame and write track.csv, track.npz, track.png, summary.json and the videos.
+
+        ``progress`` is told how many frames are done. Ctrl-C ends the run and keeps what it had; so does an error,
+        which is raised again once everything before it is written.
         """
-        folder, done = Path(self.job.out), 0
-        stopped: BaseException | None = None
-        lost = torch.zeros(len(self.templates.centers), dtype=torch.int64)
-        last = torch.zeros_like(lost)
-        writer, overlay = self._writers(folder)
-        try:
-            with writer, overlay:
-                for number, frame in enumerate(self.frames):
-                    try:
-                        estimate = self.tracker(frame)
-                    except ValueError as error:
-                        raise ValueError(f"frame {number}: {error}") from error
-                    writer.write(estimate)
-                    overlay.write(frame, estimate)
-                    last = estimate.status.cpu().long()
-                    lost += ~Status.good(last)
-                    done += 1
-                    progress(estimate)
-        except (KeyboardInterrupt, ValueError) as error:
-            stopped = error
-        if done:
-            plot_track(folder / "track.npz", folder / "track.png", title=self.source.name)
-        if isinstance(stopped, ValueError):
-            raise stopped
-        return Finished(done, lost, last, folder, stopped is not None)
+        with claim(self.folder):
+            films = [film for film in (self._overlay(), self._stabilised()) if film is not None]
+            left = self._left(films)
+            run = _Run(self.tracker, self._track_writer(left), films, stop_at_damage=self.job.stop_at_damage)
+            if left is not None:
+                run.go_on(left.records(self.folder))
+            stopped: BaseException | None = None
+            try:
+                with run:
+                    frames = self._frames(left)
+                    for frame in ahead(map(with_picture, frames) if films else frames):
+                        run.step(frame)
+                        progress(run.done)
+            except (KeyboardInterrupt, ValueError) as error:
+                stopped = error
+            except OSError as error:
+                raise _told(error, run.done) from error
+            if run.done:
+                self._plot()
+                self._remove_old({film.film.name for film in films})
+            if isinstance(stopped, ValueError):
+                raise stopped
+        return Finished(run.done, run.damaged, run.lost, run.last, self.folder, stopped is not None)
 
-    def _writers(self, folder: Path) -> tuple[TrackWriter, OverlayWriter | _NoOverlay]:
-        matrix = None
-        if self.calibration is not None:
-            matrix = self.calibration.matrix(torch.zeros(1, dtype=torch.float64))[:2, :2]
-        settings = {name: value for name, value in dataclasses.asdict(self.job).items() if value not in (None, ())}
-        writer = TrackWriter(folder, status_names=STATUS_NAMES, fps=self.fps, um_matrix=matrix, settings=settings)
-        if not self.job.overlay:
-            return writer, _NoOverlay()
-        shapes = self.templates.shapes
-        return writer, OverlayWriter(folder, shapes=shapes, status_names=STATUS_NAMES, fps=self.fps)
+    def _remove_old(self, films: set[str]) -> None:
+        """What a result before had and this one does not."""
+        for name in {"overlay", "stabilised"} - films:
+            (self.folder / f"{name}.mp4").unlink(missing_ok=True)
 
-
-class _NoOverlay(nullcontext[None]):
-    def write(self, frame: Tensor, estimate: Estimate) -> None:
-        """Nothing: the run goes without pictures."""
-
-
-def read_templates(job: TrackJob) -> Tensor | None:
-    """The images of ``job.template``, (R, 1, h, w) float, None if there are none. ValueError if they do not fit."""
-    if not job.template:
-        return None
-    for name, given in (("reference", job.reference), ("size", job.size), ("polygons", job.polygons)):
-        if given:
-            raise ValueError(f"{name}: not with template, whose image tells it all; got {given}")
-    if job.centers and len(job.centers) != len(job.template):
-        raise ValueError(f"centers: expected one per template ({len(job.template)}), got {len(job.centers)}")
-    crops = [as_gray("template", name, next(iter(open_frames(name)))) for name in job.template]
-    sizes = {f"{crop.shape[-1]}x{crop.shape[-2]}" for crop in crops}
-    if len(sizes) > 1:
-        raise ValueError(f"template: expected images of one size, got {sorted(sizes)} px")
-    return torch.cat(crops)
-
-
-def refuse_doubt(located: Located, placed: bool) -> None:
-    """ValueError for the first template that the first frame does not show, or shows at several places unless it is
-    known which one is meant."""
-    for r, status in enumerate(located.status.tolist()):
-        best, other = (_place(*p.tolist()) for p in (located.pose[r], located.runner_up.pose[r]))
-        score, second = float(located.score[r]), float(located.runner_up_score[r])
-        if not Status.good(located.status[r]):
-            why = f". {Status.describe(status)}" if status == Status.LOW_TEXTURE else ""
-            raise ValueError(f"template: number {r} is not in the first frame (best: {best}, score {score:.3f}){why}")
-        if bool(located.ambiguous[r]) and not placed:
+    def _left(self, films: list[Pictures]) -> Unfinished | None:
+        """What an unfinished run has left to go on with. ValueError if it was another one, or if nobody said so."""
+        left = Unfinished.of(self.folder)
+        if self.job.force or left is None:
+            return None
+        if not self.job.resume:
             raise ValueError(
-                f"template: number {r} may be at {best} (score {score:.3f}) or at {other} (score {second:.3f}); "
-                "a center tells which one is meant"
+                f"out: {self.folder} holds an unfinished run: --resume goes on with it, --force starts anew"
             )
+        for name in left.settings | self.settings:
+            before, now = left.settings.get(name), self.settings.get(name)
+            if before != now:
+                raise ValueError(f"resume: {name} was {before!r} in the run in {self.folder}, and is {now!r} now")
+        whole = min([left.frames, *(each.film.left for each in films)])
+        return left._replace(frames=whole) if whole else None
+
+    def _frames(self, left: Unfinished | None) -> Iterator[Frame]:
+        """Those that are not done yet."""
+        if left is None:
+            return iter(self.source)
+        last = int(left.records(self.folder)["frame"][-1])
+        return (frame for frame in self.source if frame.number > last)
+
+    def _track_writer(self, left: Unfinished | None) -> TrackWriter:
+        """Of track.csv, track.npz and summary.json."""
+        return TrackWriter(
+            self.folder,
+            status_names=STATUS_NAMES,
+            fps=self.source.fps,
+            um_matrix=self._um_matrix(),
+            settings=self.settings,
+            unfinished=left,
+        )
+
+    def _overlay(self) -> OverlayWriter | None:
+        """Of overlay.mp4, if that is wanted."""
+        if not self.job.overlay:
+            return None
+        um, shapes, fps = self._um_matrix(), self.templates.shapes, self.source.fps
+        return OverlayWriter(self.folder, shapes=shapes, status_names=STATUS_NAMES, fps=fps, um_matrix=um)
+
+    def _stabilised(self) -> StabilisedWriter | None:
+        """Of stabilised.mp4, if that is wanted."""
+        template = self.job.stabilise
+        return None if template is None else StabilisedWriter(self.folder, template, fps=self.source.fps)
+
+    def _um_matrix(self) -> Tensor | None:
+        if self.calibration is None:
+            return None
+        return self.calibration.matrix(torch.zeros(1, dtype=torch.float64))[:2, :2]
+
+    def _plot(self) -> None:
+        from torch_ecc.plots import plot_track  # slow to import
+
+        plot_track(self.folder / "track.npz", self.folder / "track.png", title=self.source.name)
 
 
-def _place(x: float, y: float, theta: float) -> str:
-    return f"x={x:.1f}, y={y:.1f}, theta={math.degrees(theta):.1f} deg"
+class _Run:
+    """The files and the counts of a run: ``done`` frames, so many ``damaged``, how many each template was ``lost`` in
+    of the others, and its ``last`` status."""
+
+    def __init__(self, tracker: Tracker, track: TrackWriter, films: list[Pictures], *, stop_at_damage: bool) -> None:
+        self.tracker, self.track, self.films, self.stop_at_damage = tracker, track, films, stop_at_damage
+        self.done, self.damaged = 0, 0
+        self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
+        # What the next frame depends on: all of it goes into the journal with every frame.
+        self._state = [part for name, part in tracker.named_buffers() if name not in CONSTANT]
+        self._views = [part.numpy() for part in self._state if part.device.type == "cpu"]  # they see what is written
+        for film in films:
+            film.film.resumable = True
+        self._open = ExitStack()
+
+    def __enter__(self) -> Self:
+        for writer in (self.track, *self.films):
+            self._open.enter_context(writer)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._open.__exit__(*error)
+
+    def step(self, frame: Frame) -> None:
+        """One frame more. ValueError for one that is damaged, if that is to be the end."""
+        try:
+            if frame.pixels is None:
+                raise ValueError(frame.damage)
+            estimate = self.tracker(frame.pixels)
+        except ValueError as error:
+            if self.stop_at_damage:
+                raise ValueError(f"frame {frame.number}: {error}") from error
+            frame, estimate = dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
+        views = self._views or [part.cpu().numpy() for part in self._state]
+        self.track.write(estimate, frame, b"".join(view.tobytes() for view in views))
+        for film in self.films:
+            film.write(frame, estimate)
+        self._count(estimate.status.cpu().numpy()[None])
+
+    def _count(self, status: NDArray[np.int8]) -> None:
+        """Frames more with ``status`` (F, R)."""
+        self.done, self.last = self.done + len(status), status[-1]
+        if status.max() > Status.MAX_ITERATIONS:
+            damaged = status == Status.DAMAGED
+            self.damaged += int(damaged[:, 0].sum())
+            self.lost += ((status > Status.MAX_ITERATIONS) & ~damaged).sum(0)
+
+    def go_on(self, records: NDArray[Any]) -> None:
+        """After the ``records`` (F,) of an unfinished run."""
+        state = np.array(records["state"][-1]).tobytes()
+        for part in self._state:
+            size = part.numel() * part.element_size()
+            value = np.frombuffer(state[:size], part.cpu().numpy().dtype).reshape(tuple(part.shape))
+            part.copy_(torch.from_numpy(value.copy()))
+            state = state[size:]
+        status = np.array(records["status"])
+        for film in self.films:
+            film.go_on(np.array(records["pose"]), status <= Status.MAX_ITERATIONS)
+        self._count(status)
 
 
-def choose_templates(job: TrackJob) -> Templates:
-    """Centres, size and masks of a job; polygons bring what is not given. ValueError if that leaves something open."""
-    if not job.centers and not job.polygons:
-        raise ValueError("centers: expected at least one (x, y), or a polygon, got none")
-    if job.centers and job.polygons and len(job.centers) != len(job.polygons):
-        raise ValueError(f"polygons: expected one per center ({len(job.centers)}), got {len(job.polygons)}")
-    polygons = [np.array(polygon, dtype=np.float64) for polygon in job.polygons]
-    for number, polygon in enumerate(polygons):
-        if len(polygon) < 3 or not np.isfinite(polygon).all():
-            raise ValueError(f"polygons: polygon {number} needs three or more finite corners, got {polygon.tolist()}")
-    middles = [tuple(np.round((p.min(0) + p.max(0)) / 2)) for p in polygons]
-    centers = np.array(job.centers or middles, dtype=np.float64)
-    size = job.size
-    if size is None:
-        if not polygons:
-            raise ValueError("size: expected the side of the templates in px, got none")
-        size = 2 * math.ceil(max(np.abs(p - c).max() for p, c in zip(polygons, centers, strict=True))) + 1
-    h, w = (size, size) if isinstance(size, int) else size
-    if not polygons:
-        return Templates(torch.from_numpy(centers), (h, w), None)
-    masks = [
-        _rasterise(p, np.round(c - (w / 2 - 0.5, h / 2 - 0.5)), (h, w)) for p, c in zip(polygons, centers, strict=True)
-    ]
-    return Templates(torch.from_numpy(centers), (h, w), torch.stack(masks))
+def with_picture(frame: Frame) -> Frame:
+    """A frame whose picture is made already: on the thread that reads ahead."""
+    if frame.colours is None:
+        return frame
+    colours = frame.colours()
+    return dataclasses.replace(frame, colours=lambda: colours)
 
 
-def _rasterise(polygon: NDArray[np.float64], corner: NDArray[np.float64], size: tuple[int, int]) -> Tensor:
-    """Mask (h, w) of the pixels inside a polygon (N, 2) and on its border, ``corner`` being pixel (0, 0)."""
-    mask = np.zeros(size, dtype=np.uint8)
-    fraction_bits = 4
-    corners = np.round((polygon - corner) * 2**fraction_bits).astype(np.int32)
-    cv2.fillPoly(mask, [corners], 1, shift=fraction_bits)
-    return torch.from_numpy(mask) > 0
+def _told(error: OSError, done: int) -> OSError:
+    """The same of a full disk, with what to do."""
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not done:
+        return error
+    words = f"{error.strerror}. {done} frames are done: with some room, the same command with --resume goes on"
+    return OSError(error.errno, words)
+
+
+def settings_of(job: TrackJob, first: Tensor) -> dict[str, Any]:
+    """What a result depends on, as JSON knows it: the settings that were given, and the first frame by its checksum."""
+    given = {k: v for k, v in dataclasses.asdict(job).items() if v not in (None, (), False)}
+    checksum = zlib.crc32(first.cpu().numpy().tobytes())
+    found: dict[str, Any] = plain({k: v for k, v in given.items() if k not in NOT_OF_THE_RESULT})
+    return found | {"first_frame_crc32": checksum}
+
+
+def refuse_overwriting(folder: Path, names: Iterable[str]) -> None:
+    """ValueError if ``folder`` holds a result."""
+    there = [name for name in names if (folder / name).exists()]
+    if there:
+        raise ValueError(
+            f"out: {folder} holds a result already ({there[0]}): --out names another folder, --force replaces it, and "
+            "--resume goes on with one that is unfinished"
+        )

@@ -1,4 +1,4 @@
-"""Torch's ambient state: what is computed here does not depend on where it is called from.
+"""Torch's ambient state: what is computed here does not depend on where it is called from, nor does it change that.
 
 A model around a tracker may run under autocast or in inference mode, a script may have set a default dtype or device.
 Autocast and inference mode are kept out at the doors, with the decorators below; defaults count nowhere, since every
@@ -7,12 +7,14 @@ tensor is made with its own dtype and device.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
 import torch
+
+PIXELS_PER_THREAD = 2**20  # of templates, some 5 ms of work
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -53,3 +55,19 @@ def lasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
     A tensor made in inference mode cannot be written to outside of it, ever after.
     """
     return plain(torch.inference_mode(False)(torch.no_grad()(function)))
+
+
+@contextmanager
+def threads_for(pixels: int) -> Iterator[None]:
+    """As many of the caller's threads as templates of so many ``pixels`` are worth; one for most.
+
+    Threads wait for each other at the end of every operation that they share, spinning: on a computer that also does
+    something else, a tenth of a millisecond of work then takes as long as a time slice.
+    """
+    most = torch.get_num_threads()
+    some = min(1 + pixels // PIXELS_PER_THREAD, most)
+    torch.set_num_threads(some)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(most)

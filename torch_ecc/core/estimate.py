@@ -20,6 +20,7 @@ class Status(IntEnum):
     LOST = 2
     OUT_OF_VIEW = 3
     LOW_TEXTURE = 4
+    DAMAGED = 5
 
     @staticmethod
     def describe(code: int) -> str:
@@ -46,6 +47,7 @@ _SENTENCES = {
     Status.LOST: "The frame does not look like the template near the expected place; the last good pose is kept.",
     Status.OUT_OF_VIEW: "Too little of the template lies inside the frame; the last good pose is kept.",
     Status.LOW_TEXTURE: "The template has too little texture to fix x, y and theta; choose another patch.",
+    Status.DAMAGED: "The frame is damaged, or not like the first one; the last good pose is kept.",
 }
 
 

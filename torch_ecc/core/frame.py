@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
 from torch_ecc.core.pose import pose_dtype
@@ -70,7 +69,11 @@ def as_image(where: str, name: str, image: object, device: torch.device | str | 
     # levels), and costs a thirtieth of isfinite().all().
     if image.is_floating_point() and not gray.sum().isfinite():
         raise ValueError(f"{where}: {name} must be finite, got {_describe_nonfinite(gray)}")
-    return rgb_to_grayscale(gray[:, :3]) if gray.shape[1] > 1 else gray
+    if gray.shape[1] == 1:
+        return gray
+    from kornia.color import rgb_to_grayscale  # kornia takes longer to import than all the rest of this package
+
+    return rgb_to_grayscale(gray[:, :3])
 
 
 def _same(gray: Tensor, image: Tensor) -> bool:

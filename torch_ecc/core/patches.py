@@ -73,6 +73,8 @@ def as_size(where: str, size: Size) -> tuple[int, int]:
     pair = tuple(size) if isinstance(size, Sequence) else (size, size)
     if len(pair) != 2 or any(not isinstance(n, Integral) or n < SMALLEST for n in pair):
         raise ValueError(f"{where}: size must be one or two whole numbers of at least {SMALLEST} px, got {size!r}")
+    if max(pair) >= 1 << 31:
+        raise ValueError(f"{where}: size must fit in the frame, got {float(min(max(pair), 10**300)):g} px or more")
     return int(pair[0]), int(pair[1])
 
 

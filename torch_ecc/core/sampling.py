@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from torch_ecc.core.ambient import lasting
@@ -308,6 +307,8 @@ def blur(image: Tensor, sigma: float) -> Tensor:
     """Gaussian blur of (B, 1, H, W)."""
     size = 2 * int(4 * sigma + 0.5) + 1
     sigmas = torch.tensor([[sigma, sigma]], dtype=image.dtype, device="cpu")  # of numbers it takes the default device
+    from kornia.filters import gaussian_blur2d  # slow to import
+
     return gaussian_blur2d(image, (size, size), sigmas, border_type="reflect")
 
 

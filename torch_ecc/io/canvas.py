@@ -6,12 +6,11 @@ Everything is given in frame pixels and sized to the picture, so that it reads t
 from __future__ import annotations
 
 from functools import cache
-from math import ceil
+from math import ceil, floor
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import cv2
-import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
@@ -59,12 +58,13 @@ class Stretch(NamedTuple):
         """(H, W) or (C, H, W) -> (H, W, 3) in OpenCV's order."""
         pixels = frame.detach().cpu().numpy()
         if pixels.dtype != np.uint8:
-            scaled = (pixels.astype(np.float32) - self.low) * (255.0 / (self.high - self.low))
-            pixels = np.nan_to_num(scaled).clip(0, 255).round().astype(np.uint8)
-        planes = (
-            [pixels] * 3 if pixels.ndim == 2 else [pixels[k] for k in ((2, 1, 0) if len(pixels) == 3 else (0,) * 3)]
-        )
-        return np.asarray(cv2.merge(planes), np.uint8)
+            scale = 255.0 / (self.high - self.low)
+            above = np.fmax(pixels, np.asarray(self.low).astype(pixels.dtype))  # of NaN and a number the number
+            pixels = cv2.convertScaleAbs(above, alpha=scale, beta=-self.low * scale)
+        if pixels.ndim == 3 and len(pixels) == 3:
+            rows = np.ascontiguousarray(np.moveaxis(pixels, 0, -1))  # no copy where they were so stored
+            return np.asarray(cv2.cvtColor(rows, cv2.COLOR_RGB2BGR), np.uint8)
+        return np.asarray(cv2.cvtColor(pixels.reshape(pixels.shape[-2:]), cv2.COLOR_GRAY2BGR), np.uint8)
 
 
 class Canvas:
@@ -81,6 +81,7 @@ class Canvas:
         self.scale = max(1.0, shortest * self._zoom / 480)
         self.gap = round(3 * self.scale)
         self.step = self.scale / self._zoom
+        self._size: int = round(12.5 * self.scale)  # of letters
 
     def place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Frame pixels to canvas pixels, (..., 2): both count from the middle of their first pixel."""
@@ -97,8 +98,9 @@ class Canvas:
 
     def measure(self, text: str) -> tuple[int, int]:
         """Width and height in canvas px of the label that ``text`` makes."""
-        right, bottom = _DRAW.multiline_textbbox((0, 0), text, self._font(), spacing=self.gap)[2:]
-        return ceil(right) + 4 * self.gap, ceil(bottom) + 2 * self.gap
+        lines = text.split("\n")
+        width = max(sum(_width(self._size, letter) for letter in line) for line in lines)
+        return width + 4 * self.gap, len(lines) * (_height(self._size) + self.gap) + self.gap
 
     def clamp(self, box: Box) -> Box:
         """The box moved to where all of it is on the canvas, as far as that is large enough."""
@@ -108,21 +110,49 @@ class Canvas:
     def label(self, spot: Box, text: str, colour: Colour) -> None:
         """``text`` on dark ground with an edge of ``colour``, at a ``spot`` of the canvas as large as ``measure``."""
         ground = self.image[spot.y : spot.y + spot.h, spot.x : spot.x + spot.w]
-        ink = Image.new("L", (ground.shape[1], ground.shape[0]))
-        ImageDraw.Draw(ink).multiline_text((3 * self.gap, self.gap), text, 255, self._font(), spacing=self.gap)
-        alpha = np.asarray(ink, np.float32)[..., None] / 255
+        ground[:] = ground * np.float32(0.3)
         tint = (np.array(WHITE, np.float32) + np.array(colour, np.float32)) / 2
-        ground[:] = (1 - alpha) * (0.3 * ground) + alpha * tint
+        for number, line in enumerate(text.split("\n")):
+            ink = (
+                np.hstack([_glyph(self._size, letter) for letter in line]) if line else np.zeros((0, 0, 1), np.float32)
+            )
+            top = self.gap + number * (_height(self._size) + self.gap)
+            under = ground[top : top + ink.shape[0], 3 * self.gap : 3 * self.gap + ink.shape[1]]
+            ink = ink[: under.shape[0], : under.shape[1]]
+            under[:] = under + ink * (tint - under)
         ground[:, : self.gap] = colour
-
-    def _font(self) -> ImageFont.FreeTypeFont:
-        return _load_font(round(12.5 * self.scale))
 
 
 @cache
 def _load_font(size: int) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which comes with matplotlib and knows theta and the degree sign."""
+    import matplotlib as mpl  # slow to import
+
     return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
 
 
-_DRAW = ImageDraw.Draw(Image.new("L", (1, 1)))
+@cache
+def _glyph(size: int, letter: str) -> NDArray[np.float32]:
+    """How much ink a letter leaves where, (h, w, 1) in [0, 1]: drawn once, since labels change in every frame."""
+    font = _load_font(size)
+    ink = Image.new("L", (_width(size, letter), _height(size)))
+    ImageDraw.Draw(ink).text((0, -_top(size)), letter, 255, font)
+    return np.asarray(ink, np.float32)[..., None] / np.float32(255)
+
+
+@cache
+def _width(size: int, letter: str) -> int:
+    return max(round(_load_font(size).getlength(letter)), 1)
+
+
+@cache
+def _height(size: int) -> int:
+    return ceil(_load_font(size).getbbox(_TALLEST)[3]) - _top(size)
+
+
+@cache
+def _top(size: int) -> int:
+    return floor(_load_font(size).getbbox(_TALLEST)[1])
+
+
+_TALLEST = "Δθy("

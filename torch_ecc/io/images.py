@@ -1,135 +1,148 @@
-"""Image files, one frame each, and the pages of a multi-page TIFF.
-
-TIFF goes through Pillow, which walks the pages in one pass; the few kinds that Pillow cannot open, or would cut down to
-8 bits, and all other formats go through OpenCV.
-"""
+"""Image files, one frame each, in the order of the numbers in their names, through Pillow (JPEG), tifffile
+(TIFF) and OpenCV."""
 
 from __future__ import annotations
 
 import re
-import sys
-import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from torch_ecc.io.frames import FrameError, Medium, Pixels
+from torch_ecc.io.axes import Choice, check_single
+from torch_ecc.io.frames import Medium, Pixels, Raw, brief, check_size
+from torch_ecc.io.tiff import TIFF, open_tiff
 
-TIFF = frozenset({".tif", ".tiff"})
 IMAGES = TIFF | {".png", ".bmp", ".jpg", ".jpeg", ".jp2", ".webp", ".pgm", ".ppm", ".pnm"}
 _SAME = {".tiff": ".tif", ".jpeg": ".jpg"}
-_CHUNK_BYTES = 1 << 25
+# A number with a decimal point is one number; of more than two parts, as in dates and versions, each is its own.
+_DECIMAL = r"(?<![0-9.])[0-9]+\.([0-9]+)(?![0-9]|\.[0-9])"
+_NUMBER = re.compile(f"({_DECIMAL.replace('([0-9]+)', '[0-9]+')}|[0-9]+)")
+_WHOLE = re.compile("([0-9]+)")
+_TOLD_GAPS = 3
 
 
-def natural_key(path: Path) -> list[str | int]:
-    """Sorts f2 before f10."""
-    return [int(part) if part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", path.as_posix())]
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """By the numbers in their names: f2 before f10, and t_0.5s before t_1s."""
+    paths = list(paths)
+    fractions = {each for path in paths for each in re.findall(_DECIMAL, path.stem)}
+    # 1.9 and 1.10 are two numbers with a point between them: nobody writes the decimal 1.1 like this beside 1.9.
+    counted = len({len(each) for each in fractions}) > 1 and any(each[1:].endswith("0") for each in fractions)
+    number = _WHOLE if counted else _NUMBER
+
+    def key(path: Path) -> list[str | Fraction]:
+        parts = number.split(path.with_suffix("").as_posix().casefold())
+        return [Fraction(part) if k % 2 else part for k, part in enumerate(parts)] + [path.suffix.casefold()]
+
+    return sorted(paths, key=key)
 
 
-def open_images(paths: Sequence[Path], where: str) -> Medium:
+def open_images(paths: Sequence[Path], where: str, choice: Choice) -> Medium:
     """One frame per file, in natural order; ValueError if none of the files is an image, or two formats are mixed."""
-    images = sorted((path for path in paths if path.suffix.lower() in IMAGES), key=natural_key)
+    images = in_order(path for path in paths if path.suffix.lower() in IMAGES)
     if not images:
         raise ValueError(f"open_frames: no image in {where} (known: {' '.join(sorted(IMAGES))})")
     kinds = Counter(_SAME.get(path.suffix.lower(), path.suffix.lower()) for path in images)
     if len(kinds) > 1:
         found = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
         raise ValueError(f"open_frames: several kinds of image in {where} ({found}); name one, as in '*{min(kinds)}'")
-    return Medium(lambda: _read_files(images), len(images), label=lambda index: images[index].name)
+    if not kinds.keys() & TIFF:
+        check_single(where, choice)
+
+    def read(numbers: range) -> Iterator[Raw]:
+        for number in range(numbers.start, min(numbers.stop, len(images)), numbers.step):
+            yield _read_file(images[number], number, choice)
+
+    return Medium(read, len(images), notes=_gaps(images))
 
 
-def _read_files(paths: Sequence[Path]) -> Iterator[Pixels]:
-    for index, path in enumerate(paths):
-        try:
-            yield _read_file(path)
-        except (ValueError, OSError) as error:
-            raise FrameError(index, f"{path.name} cannot be read ({error})") from error
-
-
-def _read_file(path: Path) -> Pixels:
-    if path.suffix.lower() not in TIFF:
-        return _to_rgb(cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED))
-    pages = _read_pages(path)
-    first = next(pages, None)
-    if first is None:
-        raise ValueError("it has no page")
-    if next(pages, None) is not None:
-        raise ValueError("it has several pages; give a multi-page TIFF as the source itself")
-    return first
-
-
-def open_tiff(path: Path) -> Medium:
-    """One frame per page. ValueError if it is no TIFF, or an ImageJ stack beyond 4 GB, which hides its frames."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            with Image.open(path) as image:
-                length, text = getattr(image, "n_frames", 1), str(image.getexif().get(270, ""))
-        except UnidentifiedImageError:
-            length, text = cv2.imcount(str(path), cv2.IMREAD_UNCHANGED), ""
-        except Exception:  # a damaged page list: Pillow raises what its parser stumbles on; the frames before it count
-            length, text = None, ""
-    if length == 0:
-        raise ValueError(f"open_frames: {path} cannot be read as TIFF")
-    hidden = re.search(r"ImageJ=.*^images=([0-9]+)", text, re.DOTALL | re.MULTILINE)
-    if hidden and length is not None and int(hidden[1]) > length:
-        raise ValueError(
-            f"open_frames: {path} is an ImageJ stack of {hidden[1]} images with {length} TIFF page(s): "
-            "save it as an image sequence or in parts under 4 GB"
-        )
-    return Medium(lambda: _read_pages(path), length, label="page {}".format)
-
-
-def _read_pages(path: Path) -> Iterator[Pixels]:
+def _read_file(path: Path, number: int, choice: Choice) -> Raw:
     try:
-        image = Image.open(path)
+        if path.stat().st_size == 0:
+            raise ValueError("it is empty")
+        if path.suffix.lower() in TIFF:
+            return Raw(number, _read_tiff(path, choice), name=path.name)
+        pixels, colours = _read_image(path)
+        return Raw(number, pixels, name=path.name, colours=colours)
     except UnidentifiedImageError:
-        yield from _read_pages_opencv(path)
-        return
-    with image:
-        for index in range(sys.maxsize):
-            try:
-                page = _read_page(image, index)
-            except EOFError:
-                return
-            except Exception as error:  # whatever Pillow's parsers stumble on in a damaged page
-                raise FrameError(index, f"{path.name} is damaged there ({error})") from error
-            if page is None:
-                yield from _read_pages_opencv(path)
-                return
-            yield page
+        return Raw(number, f"{path.name} cannot be read (it is damaged or not an image)", name=path.name)
+    except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
+        return Raw(number, f"{path.name} cannot be read ({brief(error)})", name=path.name)
 
 
-def _read_page(image: Image.Image, index: int) -> Pixels | None:
-    """One page as it is stored; None where Pillow would cut colours of 16 bits down to 8."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        image.seek(index)
-        bits = getattr(image, "tag_v2", {}).get(258, (8,))
-        if len(image.getbands()) > 1 and max(bits) > 8:
-            return None
-        plain = image.mode in ("1", "L", "LA", "RGB", "RGBA", "I", "F") or image.mode.startswith("I;16")
-        return np.array(image if plain else image.convert("RGB"))
+def _read_tiff(path: Path, choice: Choice) -> Pixels:
+    frames = open_tiff(path, choice).read(range(2))
+    first, second = next(frames, None), next(frames, None)
+    if first is None or isinstance(first.pixels, str):
+        raise ValueError("it has no page" if first is None else first.pixels)
+    if second is not None:
+        raise ValueError("it has several pages; give a multi-page TIFF as the source itself")
+    return first.pixels
 
 
-def _read_pages_opencv(path: Path) -> Iterator[Pixels]:
-    """OpenCV finds each page from the start of the file, so several are fetched at once, up to a fixed memory."""
-    count, index, chunk = cv2.imcount(str(path), cv2.IMREAD_UNCHANGED), 0, 1
-    while index < count:
-        pages = cv2.imreadmulti(str(path), index, min(chunk, count - index), flags=cv2.IMREAD_UNCHANGED)[1]
-        if not pages:
-            raise FrameError(index, f"{path.name} is damaged there")
-        yield from map(_to_rgb, pages)
-        index += len(pages)
-        chunk = max(1, _CHUNK_BYTES // pages[0].nbytes)
+def _read_image(path: Path) -> tuple[Pixels, Callable[[], Pixels] | None]:
+    """As it is stored, whatever orientation it tells of, and how its colours are had if these are its grey levels."""
+    with Image.open(path) as image:  # its header, and the checksums of PNG: OpenCV tells neither before it decodes
+        check_size("it", *image.size)
+        kind = image.format
+        if kind != "JPEG":
+            image.verify()
+    if kind == "JPEG":
+        return _by_pillow(path, "L"), lambda: _by_pillow(path, "RGB")
+    pixels = _by_opencv(path)
+    if kind == "JPEG2000" and pixels.dtype == np.uint8:
+        return _by_pillow(path, None), None  # OpenCV passes over its palettes
+    return pixels, None
 
 
-def _to_rgb(array: Pixels | None) -> Pixels:
-    """OpenCV's (H, W), BGR or BGRA as (H, W) or RGB; None is what OpenCV returns for a file that it cannot decode."""
-    if array is None:
+def _by_pillow(path: Path, mode: str | None) -> Pixels:
+    """In this mode, of which "L" is the luma of a JPEG as it was coded; without one, in L or RGB."""
+    with Image.open(path) as image:
+        if mode and image.mode in ("L", "RGB"):
+            image.draft(mode, image.size)
+        plain = mode or ("L" if image.mode in ("L", "LA") else "RGB")
+        return np.array(image if image.mode == plain else image.convert("RGB").convert(plain))
+
+
+def _by_opencv(path: Path) -> Pixels:
+    log = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    finally:
+        cv2.utils.logging.setLogLevel(log)
+    if pixels is None:
         raise ValueError("it is damaged or not an image")
-    return array if array.ndim == 2 or array.shape[2] < 3 else array[:, :, 2::-1]
+    return pixels if pixels.ndim == 2 or pixels.shape[2] < 3 else np.ascontiguousarray(pixels[:, :, 2::-1])
+
+
+def _gaps(images: Sequence[Path]) -> tuple[str, ...]:
+    """A sentence on the numbers that are missing between files that differ in one whole number only."""
+    names = [_NUMBER.split(path.stem) for path in images]
+    places = [k for k in range(1, min(map(len, names)), 2) if len({name[k] for name in names}) > 1]
+    if len(places) != 1 or len(images) < 3 or any("." in name[places[0]] for name in names):
+        return ()
+    k = places[0]
+    if len({(*name[:k], *name[k + 1 :]) for name in names}) > 1:
+        return ()
+    numbers = [int(name[k]) for name in names]
+    steps = Counter(b - a for a, b in pairwise(numbers))
+    step = min(steps, key=lambda each: (-steps[each], each))
+    gaps = [(name, a + step, b - step) for name, (a, b) in zip(names, pairwise(numbers), strict=False) if b - a > step]
+    if not gaps or step < 1:
+        return ()
+    told = [_gap(name, k, first, last) for name, first, last in gaps[:_TOLD_GAPS]]
+    told += [f"{len(gaps) - _TOLD_GAPS} more stretches"] if len(gaps) > _TOLD_GAPS else []
+    return (f"missing in the numbering of the files: {', '.join(told)}",)
+
+
+def _gap(name: list[str], k: int, first: int, last: int) -> str:
+    ends = dict.fromkeys("".join([*name[:k], f"{n:0{len(name[k])}d}", *name[k + 1 :]]) for n in (first, last))
+    return " to ".join(ends)

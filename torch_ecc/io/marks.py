@@ -6,11 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from torch_ecc.core.pose import transform
 from torch_ecc.io.canvas import Box, Canvas, Colour
 from torch_ecc.io.records import CONVERGED, DOUBTFUL
 
@@ -21,14 +18,17 @@ _Side: TypeAlias = Literal["above", "below", "right", "left", "tag"]
 
 
 class Mark(NamedTuple):
-    """A template in a frame: ``pose`` (3,), ``outlines`` (N, 2) from its centre, ``trail`` of (x, y), all in px."""
+    """A template in a frame: ``pose`` (3,) px, px, rad, as a ``warp`` (2, 3) too, ``outlines`` (N, 2) from its centre
+    and ``trail`` of (x, y) in px; where the scale is known, what it has ``moved`` (2,) in micrometres."""
 
     number: int
-    pose: Tensor
+    pose: NDArray[np.float64]
+    warp: NDArray[np.float64]
     score: float
     word: str
-    outlines: list[Tensor]
+    outlines: list[NDArray[np.float64]]
     trail: Collection[NDArray[np.float64]]
+    moved: NDArray[np.float64] | None = None
 
     @property
     def lost(self) -> bool:
@@ -40,9 +40,10 @@ class Mark(NamedTuple):
         """Green for converged, orange for doubtful, red for lost."""
         return _COLOURS.get(self.word, _LOST)
 
-    def on_frame(self, points: Tensor) -> NDArray[np.float64]:
+    def on_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Template points (N, 2) to frame points (N, 2)."""
-        return transform(self.pose, points).numpy()
+        placed: NDArray[np.float64] = points @ self.warp[:, :2].T + self.warp[:, 2]
+        return placed
 
     def box(self, canvas: Canvas) -> Box:
         """What the outline takes of the canvas."""
@@ -58,7 +59,8 @@ class Mark(NamedTuple):
             return f"{self.number} LOST" if self.lost else str(self.number)
         if self.lost:
             return f"{self.number}   LOST{reason}\nlast at  x {x:.2f}   y {y:.2f}"
-        return f"{self.number}   x {x:.2f}   y {y:.2f}\nθ {np.degrees(theta):.3f}°   score {self.score:.3f}"
+        um = "" if self.moved is None else "\nΔx {:+.3f} µm   Δy {:+.3f} µm".format(*self.moved)
+        return f"{self.number}   x {x:.2f}   y {y:.2f}{um}\nθ {np.degrees(theta):.3f}°   score {self.score:.3f}"
 
 
 def draw(canvas: Canvas, mark: Mark) -> None:
@@ -67,17 +69,17 @@ def draw(canvas: Canvas, mark: Mark) -> None:
         canvas.line(np.stack(tuple(mark.trail)), _TRAIL)
     for line in mark.outlines:
         canvas.line(mark.on_frame(line), mark.colour, closed=True, width=1.5)
-    reach = float(min(torch.vstack(mark.outlines).amax(0)))
+    reach = float(np.vstack(mark.outlines).max(0).min())
     for axis in _cross(max(0.12 * reach, 4 * canvas.step)):
         canvas.line(mark.on_frame(axis), mark.colour)
 
 
-def _cross(arm: float) -> tuple[Tensor, Tensor]:
+def _cross(arm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The centre cross as a y line and an x line; the x line is drawn out to the right and ends in an arrow head."""
     tip, back, half = 4 * arm, 3.2 * arm, 0.6 * arm
     across = ((0.0, -arm), (0.0, arm))
     along = ((-arm, 0.0), (tip, 0.0), (back, -half), (tip, 0.0), (back, half))
-    return torch.tensor(across, dtype=torch.float64), torch.tensor(along, dtype=torch.float64)
+    return np.array(across), np.array(along)
 
 
 class Labels:

@@ -2,68 +2,105 @@
 
 from __future__ import annotations
 
+import math
 from glob import glob
 from pathlib import Path
 
+from torch_ecc.io.animation import ANIMATIONS, is_animated, open_animation
+from torch_ecc.io.axes import Choice, check_single
+from torch_ecc.io.camera import open_camera
+from torch_ecc.io.cine import open_cine
+from torch_ecc.io.extras import open_extra
 from torch_ecc.io.frames import FrameSource, Medium
-from torch_ecc.io.images import IMAGES, TIFF, open_images, open_tiff
-from torch_ecc.io.stacks import open_npy, open_npz
-from torch_ecc.io.video import VIDEOS, open_camera, open_video
+from torch_ecc.io.images import IMAGES, open_images
+from torch_ecc.io.stacks import Stack, open_npy, open_npz, open_stack
+from torch_ecc.io.tiff import TIFF, open_tiff
+from torch_ecc.io.video import VIDEOS, open_video
+
+_PLAIN = {
+    ".npy": open_npy,
+    ".npz": open_npz,
+    ".cine": open_cine,
+    **dict.fromkeys(VIDEOS, open_video),
+    **dict.fromkeys(ANIMATIONS, open_animation),
+}
 
 
-def open_frames(source: str | Path | int) -> FrameSource:
-    """A stream of frames from whatever ``source`` is.
+def open_frames(
+    source: str | Path | int | Stack,
+    *,
+    fps: float | None = None,
+    channel: int | None = None,
+    slice: int | None = None,
+    position: int | None = None,
+) -> FrameSource:
+    """A stream of frames, each with its own time, from whatever ``source`` is.
 
-    A video file; an image; a folder or a glob (``"run3/*.png"``) of images in natural order; a multi-page TIFF of 8 or
-    16 bits or float; an .npy stack, (F, H, W) or with 1, 3 or 4 channels, first or last; an .npz with such an array
-    named ``frames`` or alone; a camera index, as a number or in digits ("0"). The first frame is read here, the others
-    when they are asked for.
+    A video file; an animated GIF, PNG or WebP; an image; a folder or a glob (``"run3/*.png"``) of images in the order
+    of the numbers in their names; a TIFF with one time axis; an .npy stack, (F, H, W) or with 1, 3 or 4 channels, first
+    or last; an .npz with such an array named ``frames`` or alone; anything indexed like such an array (numpy, dask,
+    zarr, h5py); a camera index, as a number or in digits ("0"). Frames are read when they are asked for.
 
-    Raises FileNotFoundError where nothing is there, and ValueError for what cannot be read, in words.
+    ``fps`` in Hz: the frames' times, instead of the source's own. ``channel``, ``slice``, ``position``, from 0: which
+    of them to read where a source has several; they are never taken for time. Raises FileNotFoundError where nothing
+    is there, and ValueError for what cannot be read, in words.
     """
-    if isinstance(source, int):
-        return FrameSource(f"camera {source}", open_camera(source))
+    if fps is not None and not 0 < fps < math.inf:
+        raise ValueError(f"open_frames: fps must be a rate > 0 in Hz, got {fps:g}")
+    name, medium = _open(source, Choice(channel, slice, position))
+    return FrameSource(name, medium, fps=fps)
+
+
+def _open(source: str | Path | int | Stack, choice: Choice) -> tuple[str, Medium]:
+    if not isinstance(source, str | Path | int):
+        name = f"{type(source).__name__}"
+        check_single(name, choice)
+        return name, open_stack(source, name)
     text = str(source).strip()
-    if text.isdecimal():
-        return FrameSource(f"camera {int(text)}", open_camera(int(text)))
     path = Path(text).expanduser()
-    if text and path.exists():
-        return FrameSource(path.name or str(path), _open_path(path))
+    if not isinstance(source, int) and text and path.exists():  # a folder named by digits is no camera
+        return path.name or str(path), _open_path(path, choice)
+    if isinstance(source, int) or (text.isascii() and text.isdecimal()):
+        check_single(f"camera {int(text)}", choice)
+        return f"camera {int(text)}", open_camera(int(text))
     if any(wildcard in text for wildcard in "*?["):
-        return _open_glob(path)
+        return _open_glob(path, choice)
     raise FileNotFoundError(f"open_frames: no such file, folder or camera: {text!r}")
 
 
-def _open_path(path: Path) -> Medium:
-    if path.is_dir():
-        return _open_folder(path)
+def _open_path(path: Path, choice: Choice) -> Medium:
     suffix = path.suffix.lower()
+    if path.is_dir() and suffix != ".zarr":
+        return _open_folder(path, choice)
+    if path.stat().st_size == 0:
+        raise ValueError(f"open_frames: {path} is empty")
+    extra = open_extra(path, choice)
+    if extra is not None:
+        return extra
     if suffix in TIFF:
-        return open_tiff(path)
-    if suffix in IMAGES:
-        return open_images([path], str(path))
-    if suffix in VIDEOS:
-        return open_video(path)
-    if suffix == ".npy":
-        return open_npy(path)
-    if suffix == ".npz":
-        return open_npz(path)
-    known = " ".join(sorted(IMAGES | VIDEOS | {".npy", ".npz"}))
-    raise ValueError(f"open_frames: {path.name} has the extension {suffix!r}, which is not known (known: {known})")
+        return open_tiff(path, choice)
+    if suffix in IMAGES and not is_animated(path):
+        return open_images([path], str(path), choice)
+    opener = open_animation if suffix in IMAGES else _PLAIN.get(suffix)
+    if opener is None:
+        known = " ".join(sorted(IMAGES | _PLAIN.keys()))
+        raise ValueError(f"open_frames: {path.name} has the extension {suffix!r}, which is not known (known: {known})")
+    check_single(path.name, choice)
+    return opener(path)
 
 
-def _open_folder(folder: Path) -> Medium:
+def _open_folder(folder: Path, choice: Choice) -> Medium:
     # Hidden files are left out: some systems put a "._f001.png" beside each f001.png.
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     if not files:
         raise ValueError(f"open_frames: the folder {folder} is empty")
-    return open_images(files, f"the folder {folder}")
+    return open_images(files, f"the folder {folder}", choice)
 
 
-def _open_glob(pattern: Path) -> FrameSource:
+def _open_glob(pattern: Path, choice: Choice) -> tuple[str, Medium]:
     files = [Path(match) for match in glob(str(pattern), recursive=True)]
     if not files:
         raise FileNotFoundError(f"open_frames: no file matches {str(pattern)!r}")
     if len(files) == 1:
-        return FrameSource(files[0].name, _open_path(files[0]))
-    return FrameSource(pattern.name, open_images(files, f"the {len(files)} files that match {str(pattern)!r}"))
+        return files[0].name, _open_path(files[0], choice)
+    return pattern.name, open_images(files, f"the {len(files)} files that match {str(pattern)!r}", choice)

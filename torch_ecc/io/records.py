@@ -19,6 +19,8 @@ CONVERGED: Final = "CONVERGED"
 DOUBTFUL: Final = "MAX_ITERATIONS"
 """The two words of a frame that carries a new pose. With every other word the template was lost in that frame and its
 pose is the last good one."""
+DAMAGED: Final = "DAMAGED"
+"""The word of a frame that could not be looked at."""
 
 
 class Record(Protocol):
@@ -38,6 +40,8 @@ class Record(Protocol):
     def covariance(self) -> Tensor: ...  # (R, 3, 3)
     @property
     def residual_rms(self) -> Tensor: ...  # (R,)
+    @property
+    def coverage(self) -> Tensor: ...  # (R,)
 
 
 FIELDS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
@@ -48,6 +52,7 @@ FIELDS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
     "iterations": ("i4", ()),
     "covariance": ("f8", (3, 3)),
     "residual_rms": ("f8", ()),
+    "coverage": ("f8", ()),
 }
 """dtype and shape of each field per template."""
 
@@ -60,7 +65,7 @@ def to_arrays(record: Record) -> dict[str, NDArray[Any]]:
         value: Tensor = getattr(record, name)
         if tuple(value.shape) != (count, *tail):
             raise ValueError(f"write: record.{name} must be {(count, *tail)}, got {tuple(value.shape)}")
-        arrays[name] = value.detach().cpu().numpy().astype(dtype)
+        arrays[name] = (value if value.device.type == "cpu" else value.cpu()).detach().numpy().astype(dtype)
     return arrays
 
 

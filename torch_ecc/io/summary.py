@@ -13,16 +13,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torch_ecc.io.records import CONVERGED, DOUBTFUL, StatusNames
+from torch_ecc.io.output import append, create
+from torch_ecc.io.records import CONVERGED, DAMAGED, DOUBTFUL, StatusNames
 
 
 def summarise(records: NDArray[Any], names: StatusNames, error: BaseException | None) -> dict[str, object]:
     """What (F,) records of R templates say; ``error`` is what ended the run before its time, if anything did."""
-    templates = records["score"].shape[1]
+    templates, damaged = records["score"].shape[1], [code for code, word in names.items() if word == DAMAGED]
     return {
         "complete": error is None,
         "reason": _describe(error),
         "frames": len(records),
+        "damaged_frames": int(np.isin(records["status"][:, 0], damaged).sum()),
         "templates": templates,
         "per_template": [_summarise_template(records, names, index) for index in range(templates)],
         "versions": _versions(),
@@ -31,7 +33,8 @@ def summarise(records: NDArray[Any], names: StatusNames, error: BaseException | 
 
 def write_json(path: Path, summary: dict[str, object]) -> None:
     """Strict JSON: what is not finite becomes null, what JSON does not know becomes its text."""
-    path.write_text(json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with create(path) as file:
+        append(file, (json.dumps(plain(summary), indent=2, allow_nan=False) + "\n").encode())
 
 
 def _summarise_template(records: NDArray[Any], names: StatusNames, index: int) -> dict[str, object]:
@@ -69,11 +72,12 @@ def _versions() -> dict[str, str]:
     return {"torch_ecc": package, "torch": torch.__version__, "python": platform.python_version()}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A value as JSON knows it: what is not finite is None, what is of another kind is its text."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)

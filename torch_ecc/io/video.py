@@ -1,66 +1,161 @@
-"""Video files and cameras, through OpenCV: (H, W, 3) uint8 RGB frames."""
+"""Video files, through PyAV: the luma plane as it was coded, of 8 to 16 bits, at the times that the container gives."""
 
 from __future__ import annotations
 
-import sys
+import threading
+from collections import deque
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, TypeAlias
 
-import cv2
+import av
+import numpy as np
+from av.video.reformatter import VideoReformatter
 
-from torch_ecc.io.frames import FrameError, Medium, Pixels
+from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_size
 
-VIDEOS = frozenset(
-    ".avi .gif .m4v .mjpeg .mjpg .mkv .mov .mp4 .mpeg .mpg .mts .ogv .ts .webm .wmv .y4m".split()  # noqa: SIM905
-)
+_KINDS = "3gp asf avi dv flv h264 hevc ivf m2ts m4v mjpeg mjpg mkv mov mp4 mpeg mpg mts mxf nut ogv ts vob webm wmv y4m"
+VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
 _SLACK_FRAMES, _SLACK = 3, 0.02
+_STRICT = {"err_detect": "explode"}  # a frame that is damaged is told, and not made up from its neighbours
+_PACKED = {"yuyv422": 0, "yvyu422": 0, "uyvy422": 1}  # where the first luma byte stands among chroma bytes
+
+_conversion = threading.local()  # to colours: made once for a thread, and not, six times as dear, for each frame
+
+_Decoded: TypeAlias = "av.VideoFrame | str"
 
 
 def open_video(path: Path) -> Medium:
-    """The frames of a video file; ``length`` and ``fps`` as its container declares them."""
-    capture = cv2.VideoCapture(str(path))
-    opened, count, fps = capture.isOpened(), int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), _fps(capture)
-    capture.release()
-    if not opened:
-        raise ValueError(f"open_frames: {path} cannot be opened as a video (damaged, or a codec OpenCV does not have)")
-    return Medium(lambda: _read_video(path, max(count, 0), fps), count if count > 0 else None, fps)
+    """The frames of a video file; ``length`` and ``fps`` as its container declares them. ValueError if it has none."""
+    with _opened(path, _STRICT) as (container, stream):
+        check_size(f"open_frames: {path}", stream.width, stream.height)
+        fps, length = _rate(container, stream), _declared(container, stream)
+        ratio = stream.sample_aspect_ratio or 1
+        first = next((frame for _, frame in _decoded(container, stream)), "")
+    # Some writers never close an image as their standard wants it: a decoder that is strict would refuse every frame.
+    options = {} if isinstance(first, str) else _STRICT
+    uneven = f"{path.name}: its pixels are not square, they are {float(ratio):.4g} times as wide as high"
+    notes = (uneven,) if ratio != 1 else ()
+    return Medium(lambda numbers: _read(path, options, numbers), length or None, fps, notes=notes, exact=False)
 
 
-def open_camera(index: int) -> Medium:
-    """Frames of camera ``index`` for as long as they are asked for; iterating again goes on with what it sees then."""
-    if index < 0:
-        raise ValueError(f"open_frames: source as a camera index must be 0 or more, got {index}")
-    capture = cv2.VideoCapture(index)
-    if not capture.isOpened():
-        raise ValueError(f"open_frames: camera {index} cannot be opened")
-    return Medium(lambda: _read_camera(capture, index), None, _fps(capture))
-
-
-def _fps(capture: cv2.VideoCapture) -> float | None:
-    fps = float(capture.get(cv2.CAP_PROP_FPS))
-    return fps if fps > 0 else None
-
-
-def _read_video(path: Path, declared: int, fps: float | None) -> Iterator[Pixels]:
-    capture, index, seconds = cv2.VideoCapture(str(path)), 0, 0.0
+@contextmanager
+def _opened(path: Path, options: dict[str, str]) -> Iterator[tuple[Any, Any]]:
+    """The container and its video stream."""
     try:
-        while True:
-            read, frame = capture.read()
-            if not read:
-                break
-            index, seconds = index + 1, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
-    finally:
-        capture.release()
-    # Counted in time and with some slack: what containers declare is exact for some and an estimate for others.
-    missing = declared - 1 - seconds * fps if fps and seconds > 0 else declared - index
-    if index and missing > max(_SLACK_FRAMES, _SLACK * declared):
-        raise FrameError(index, f"{path.name} ends here, but declares {declared} frames: it is cut off or damaged")
+        container = av.open(str(path))
+    except (av.FFmpegError, OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or brief(error)
+        raise ValueError(f"open_frames: {path} cannot be opened as a video ({reason})") from error
+    with container:
+        stream = container.streams.best("video")
+        if stream is None or stream.codec_context is None:
+            raise ValueError(f"open_frames: {path} holds no video that can be decoded")
+        stream.codec_context.options = options
+        yield container, stream
 
 
-def _read_camera(capture: cv2.VideoCapture, index: int) -> Iterator[Pixels]:
-    for count in range(sys.maxsize):
-        read, frame = capture.read()
-        if not read:
-            raise FrameError(count, f"camera {index} delivers no frame any more")
-        yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+def _rate(container: Any, stream: Any) -> float | None:
+    """Frames per second, None where the format has no clock: FFmpeg then assumes one."""
+    rate = stream.average_rate or stream.guessed_rate
+    return float(rate) if rate and not container.format.flags & av.format.Flags.no_timestamps.value else None
+
+
+def _declared(container: Any, stream: Any) -> int:
+    """How many frames the container says it shows, 0 if it does not."""
+    fps, seconds, frames = _rate(container, stream), (container.duration or 0) / av.time_base, int(stream.frames)
+    by_time = round(seconds * fps) if fps else 0
+    if not frames:
+        return by_time if len(container.streams) == 1 else 0  # the duration may be that of a longer sound
+    # Of MP4 and its kin a trim only hides frames, which are counted all the same.
+    return min(frames, by_time or frames) if "mp4" in container.format.name else frames
+
+
+def _read(path: Path, options: dict[str, str], numbers: range) -> Iterator[Raw]:
+    with _opened(path, options) as (container, stream):
+        fps, count, last = _rate(container, stream), 0, 0.0
+        for time_s, frame in _decoded(container, stream):
+            if count >= numbers.stop:
+                return
+            last = time_s if time_s is not None and fps else (count / fps if fps else 0.0)
+            if count in numbers:
+                yield _raw(count, frame, last if fps else None)
+            count += 1
+        # Counted in time and with some slack: what containers declare is exact for some and an estimate for others.
+        declared, start = _declared(container, stream), float((stream.start_time or 0) * (stream.time_base or 0))
+        missing = declared - 1 - (last - start) * fps if fps and last > start else declared - count
+        if missing > max(_SLACK_FRAMES, _SLACK * declared) and declared > count:
+            reason = f"{path.name} ends here, but declares {declared} frames: it is cut off or damaged"
+            raise FrameError(count, reason)
+
+
+def _decoded(container: Any, stream: Any) -> Iterator[tuple[float | None, _Decoded]]:
+    """Time and frame, or the reason why there is none, in the order of their times. A damaged frame takes those with it
+    that are predicted from it, up to the next one that stands by itself."""
+    damaged: list[tuple[float, str]] = []
+    tainted = False
+    # AVI tells when frames are decoded and not when they are shown; FFmpeg guesses that, up to one dropped frame off.
+    # The k-th frame to be shown is so at the k-th of these times.
+    slots: deque[float] = deque()
+    guessed = container.format.name == "avi"
+    try:
+        for packet in container.demux(stream):
+            if packet.size == 0 and packet.dts is not None:
+                continue  # a dropped frame: its time passes, and there is nothing to decode
+            if guessed and packet.dts is not None:
+                slots.append(float(packet.dts * packet.time_base))
+            try:
+                frames = packet.decode()
+            except av.FFmpegError as error:
+                time = float((packet.pts or 0) * packet.time_base) if not slots else slots.pop()
+                damaged.append((time, f"it cannot be decoded ({error.strerror})"))
+                tainted = True
+                continue
+            for frame in frames:
+                time = slots.popleft() if slots else frame.time
+                while damaged and time is not None and damaged[0][0] < time:
+                    yield damaged.pop(0)
+                tainted = frame.is_corrupt or (tainted and not frame.key_frame)
+                yield time, "it is damaged, or predicted from a frame that is" if tainted else frame
+    except av.FFmpegError as error:
+        damaged.append((damaged[-1][0] if damaged else 0.0, f"the file is damaged from here on ({error.strerror})"))
+    yield from damaged
+
+
+def _raw(number: int, frame: _Decoded, time_s: float | None) -> Raw:
+    if isinstance(frame, str):
+        return Raw(number, frame, time_s)
+    turns = frame.rotation // 90
+    gray = _luma(frame)
+    if gray is None:
+        return Raw(number, np.rot90(_rgb(frame), turns), time_s)
+    colours = (lambda: np.rot90(_rgb(frame), turns)) if len(frame.format.components) > 1 else None
+    return Raw(number, np.rot90(gray, turns), time_s, colours=colours)
+
+
+def _luma(frame: av.VideoFrame) -> Pixels | None:
+    """Grey levels (H, W) in memory of their own as they are coded, None where they first have to be made."""
+    form, plane = frame.format, frame.planes[0]
+    first, *others = form.components
+    packed = _PACKED.get(form.name)
+    if plane.line_size < 0:  # the last row comes first: a conversion turns that over, if it is to another format
+        if others:
+            return None
+        turned = _luma(frame.reformat(format="gray16le" if first.bits == 8 else "gray16be"))
+        return (turned >> 8).astype(np.uint8) if turned is not None and first.bits == 8 else turned
+    plain = first.is_luma and not (form.has_palette or form.is_bit_stream or any(each.plane == 0 for each in others))
+    if packed is None and not (plain and 8 <= first.bits <= 16):
+        return None
+    dtype = "u1" if first.bits == 8 else ">u2" if form.is_big_endian else "<u2"
+    rows: Pixels = np.ndarray((frame.height, plane.line_size // np.dtype(dtype).itemsize), dtype, memoryview(plane))
+    return rows[:, : frame.width].copy() if packed is None else rows[:, packed : 2 * frame.width : 2].copy()
+
+
+def _rgb(frame: av.VideoFrame) -> Pixels:
+    """(H, W, 3), of 16 bits where the frame has more than 8."""
+    deep = any(each.bits > 8 for each in frame.format.components)
+    if not hasattr(_conversion, "own"):
+        _conversion.own = VideoReformatter()
+    made: av.VideoFrame = _conversion.own.reformat(frame, format="rgb48le" if deep else "rgb24")
+    return made.to_ndarray()

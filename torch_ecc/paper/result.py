@@ -124,6 +124,10 @@ def _row(number: Number) -> dict[str, Any]:
 
 
 def load_records(path: Path) -> dict[str, Any]:
-    """What ``save_records`` wrote."""
+    """What ``save_records`` wrote. ValueError for a picture that does not lie beside it."""
     document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    for picture in document["pictures"]:
+        beside = path.parent / picture["file"]
+        if beside.resolve().parent != path.parent.resolve():
+            raise ValueError(f"{path}: expected pictures beside it, got {picture['file']!r}")
     return document

@@ -12,6 +12,11 @@ def save(figure: Figure, path: Path, dpi: int) -> Path:
     """Under another name first: what bears the final name is whole."""
     part = path.with_name(f"{path.name}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(part, dpi=dpi, format=path.suffix.lstrip(".") or "png")
+    part.unlink(missing_ok=True)  # a link that bears its name is not followed
+    try:
+        figure.savefig(part, dpi=dpi, format=path.suffix.lstrip(".") or "png")
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
     os.replace(part, path)
     return path

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ecc.core.align import solve
-from torch_ecc.core.ambient import lasting, plain
+from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion
 from torch_ecc.core.estimate import Estimate, Origin, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
@@ -223,6 +223,10 @@ class Tracker(nn.Module):
 
         The frame is moved to the tracker's device. Raises ValueError for another shape, a wrong dtype, NaN.
         """
+        with threads_for(self.template.numel()):
+            return self._forward(frame)
+
+    def _forward(self, frame: Tensor) -> Estimate:
         state: Any = self._buffers  # a module's attributes are slow
         image = as_image("track", "frame", frame, state["pose"].device)
         if image.shape != self.frame_shape:
@@ -244,14 +248,32 @@ class Tracker(nn.Module):
         """Same as calling the tracker."""
         return self(frame)  # type: ignore[no-any-return]
 
-    def track_sequence(self, frames: Iterable[Tensor]) -> Track:
+    @torch.no_grad()
+    def skip(self) -> Estimate:
+        """The record (R, ...) of a frame that cannot be looked at: the last good poses, and Status.DAMAGED."""
+        state: Any = self._buffers
+        state["tracked"].zero_()  # what comes next has made more than one step
+        pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
+        status, origin = (none.to(torch.int8) + int(code) for code in (Status.DAMAGED, Origin.TRACKED))
+        unknown, moved = torch.diag_embed(torch.full_like(pose, torch.inf)), pose - state["start"]
+        return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone())
+
+    def track_sequence(self, frames: Iterable[Tensor | None], *, stop_at_damage: bool = False) -> Track:
         """Poses in every frame of a sequence: Track (F, R, ...).
 
-        Raises SequenceError, with the track so far, at the first frame that does not fit.
+        A frame that is missing (None), damaged (NaN) or of another size is Status.DAMAGED, and the track goes on; with
+        ``stop_at_damage`` it ends by SequenceError, with the track so far, and so it does where ``frames`` itself
+        raises a ValueError or brings something else than tensors.
         """
         estimates: list[Estimate] = []
         try:
-            estimates.extend(map(self.track, frames))
+            for frame in frames:
+                try:
+                    estimates.append(self.track(frame))  # type: ignore[arg-type]  # None is refused
+                except ValueError:
+                    if stop_at_damage or not (frame is None or isinstance(frame, Tensor)):
+                        raise
+                    estimates.append(self.skip())
         except ValueError as error:
             done = Track.stack(estimates) if estimates else None
             raise SequenceError(f"track_sequence: frame {len(estimates)}: {error}", done) from error

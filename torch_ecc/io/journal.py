@@ -1,0 +1,175 @@
+"""The two files of a run that is not finished: text rows, and one binary record per frame with the run's state.
+
+Both are appended to without a buffer, so that even a process that is killed leaves every frame but the one it was in.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import FileIO
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_ecc.io.frames import Frame
+from torch_ecc.io.output import append, create, part, reopen
+from torch_ecc.io.records import FIELDS
+from torch_ecc.io.summary import plain
+from torch_ecc.io.table import Table
+
+_RECORDS, _TABLE = "track.records", "track.csv"
+_HEADER = 8  # digits of the length of what the records begin with
+
+
+class Form(NamedTuple):
+    """What every frame of a run has: R ``templates``, times, names, micrometres, and a ``state`` of so many bytes."""
+
+    templates: int
+    timed: bool
+    named: bool
+    micrometres: bool
+    state: int
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of one frame."""
+        fields = FIELDS | ({"displacement_um": ("f8", (2,))} if self.micrometres else {})
+        own: list[Any] = [("frame", "i8")] + ([("time_s", "f8")] if self.timed else [])
+        own += [(name, dtype, (self.templates, *tail)) for name, (dtype, tail) in fields.items()]
+        return np.dtype([*own, ("state", f"V{self.state}")] if self.state else own)
+
+    @property
+    def table(self) -> Table:
+        """The text of one frame."""
+        return Table(timed=self.timed, named=self.named, micrometres=self.micrometres)
+
+
+class Unfinished(NamedTuple):
+    """What a run has left: its ``settings``, the ``form`` of its records, where they begin, and how many ``frames``
+    both files have whole."""
+
+    settings: dict[str, Any]
+    form: Form
+    start: int
+    frames: int
+
+    @staticmethod
+    def of(folder: Path) -> Unfinished | None:
+        """What is left in ``folder``; None if nothing is that one could go on with."""
+        path = part(folder, _RECORDS)
+        if not path.is_file() or path.is_symlink():
+            return None
+        with path.open("rb") as file:
+            try:
+                length = int(file.read(_HEADER))
+                told = json.loads(file.read(length))
+                form, settings = Form(*told["form"]), dict(told["settings"])
+            except (ValueError, TypeError, KeyError):  # killed before the first frame
+                return None
+        start = _HEADER + length
+        whole = (path.stat().st_size - start) // form.dtype.itemsize
+        frames = min(whole, (_lines(_rows(folder)) - 1) // form.templates)
+        return Unfinished(settings, form, start, frames) if frames > 0 else None
+
+    def records(self, folder: Path) -> NDArray[Any]:
+        """(F,) records, mapped from the file."""
+        return np.memmap(part(folder, _RECORDS), self.form.dtype, "r", self.start, shape=(self.frames,))
+
+
+@dataclass
+class Journal:
+    """Both files, open, with so many ``frames`` in them; the table has ``table_bytes``."""
+
+    folder: Path
+    form: Form
+    start: int
+    table_file: FileIO
+    records_file: FileIO
+    table_bytes: int
+    frames: int = 0
+
+    def __post_init__(self) -> None:
+        self._dtype, self._table = self.form.dtype, self.form.table
+        self.fields = [name for name in self._dtype.names or () if name != "state"]
+
+    @staticmethod
+    def begin(folder: Path, form: Form, settings: Mapping[str, Any]) -> Journal:
+        """New files."""
+        told = json.dumps({"form": form, "settings": plain(settings)}).encode()
+        header, title = b"%0*d" % (_HEADER, len(told)) + told, form.table.header.encode()
+        table, records = create(part(folder, _TABLE)), create(part(folder, _RECORDS))
+        append(records, header)
+        append(table, title)
+        return Journal(folder, form, len(header), table, records, len(title))
+
+    @staticmethod
+    def go_on(folder: Path, left: Unfinished) -> Journal:
+        """With the files of a run before, after the frames that are ``left``."""
+        path = part(folder, _TABLE)
+        if _rows(folder) != path:  # it was ended in order: its table has its name already, and keeps it until the end
+            path.unlink(missing_ok=True)
+            shutil.copyfile(_rows(folder), path)
+        with path.open("rb") as file:
+            size = sum(map(len, islice(file, 1 + left.frames * left.form.templates)))
+        whole = left.start + left.frames * left.form.dtype.itemsize
+        table, records = reopen(path, size), reopen(part(folder, _RECORDS), whole)
+        return Journal(folder, left.form, left.start, table, records, size, left.frames)
+
+    def append(self, arrays: Mapping[str, NDArray[Any]], status: list[str], frame: Frame, state: bytes) -> None:
+        """One frame more. ValueError if it is not like the first one."""
+        row = np.zeros((), self._dtype)
+        for name in set(self.fields) - {"frame", "time_s"}:
+            if arrays[name].shape != row[name].shape:
+                raise ValueError(
+                    f"write: record must have {len(row[name])} templates as before, got {len(arrays[name])}"
+                )
+            row[name] = arrays[name]
+        row["frame"] = frame.number
+        if self.form.timed:
+            row["time_s"] = np.nan if frame.time_s is None else frame.time_s
+        if self.form.state:
+            row["state"] = np.void(state)
+        text = self._table.rows(frame, arrays, status).encode()
+        append(self.records_file, row.tobytes())
+        append(self.table_file, text)
+        # A frame counts from here on: what an interrupt leaves half-written behind these marks is cut off by close().
+        self.frames, self.table_bytes = self.frames + 1, self.table_bytes + len(text)
+
+    def close(self) -> bool:
+        """Cut both files after the last whole frame; False, and no files, if there is none."""
+        size = self.start + self.frames * self._dtype.itemsize
+        for file, whole in ((self.table_file, self.table_bytes), (self.records_file, size)):
+            file.truncate(whole)
+            file.close()
+            if not self.frames:
+                os.unlink(file.name)
+        return self.frames > 0
+
+    def records(self) -> NDArray[Any]:
+        """(F,) records, mapped from the file."""
+        return Unfinished({}, self.form, self.start, self.frames).records(self.folder)
+
+    def remove(self) -> None:
+        """The results are whole: nobody needs to go on."""
+        part(self.folder, _RECORDS).unlink()
+
+
+def _rows(folder: Path) -> Path:
+    """The table of an unfinished run: with its final name if it was ended in order."""
+    path = part(folder, _TABLE)
+    return path if path.exists() else folder / _TABLE
+
+
+def _lines(path: Path) -> int:
+    """Whole ones."""
+    if not path.is_file():
+        return 0
+    with path.open("rb") as file:
+        return sum(line.endswith(b"\n") for line in file)
