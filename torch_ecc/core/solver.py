@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.pose import retract
-from torch_ecc.core.reference import Reference, each, restrict, reweigh
+from torch_ecc.core.reference import Reference, counted_pixels, each, restrict, reweigh
 from torch_ecc.core.sampling import Sampler, inside, is_cpu, make_sampler
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution, Trust, summed
@@ -74,19 +74,10 @@ def solve_at_once(
         near = max(settings.tolerance, COARSE_TOLERANCE)
         state, _, _ = iterate(coarse, image, "bilinear", state, near, max(most * 2 // 3, 1), trusted)
     state, g, visible = iterate(reference, image, settings.interpolation, state, settings.tolerance, most, trusted)
-    counted = counting(reference, visible, trusted)
+    counted = counted_pixels(reference, visible, trusted)
     fitted = reference if counted is None else reweigh(reference, counted)
     seen = reference.weight if visible is None else reference.weight * visible
     return Solution(state.pose, state.error, state.iterations, *summed(fitted, g, seen, trusted), fitted.normal)
-
-
-def counting(reference: Reference, visible: Tensor | None, trusted: Tensor | None) -> Tensor | None:
-    """By how much the pixels (B, N) count: if they are ``visible`` (B, N), as their blocks are ``trusted``; None where
-    all do."""
-    if trusted is None:
-        return visible
-    share = trusted.to(reference.weight.dtype)[:, reference.grid.block]
-    return share if visible is None else share * visible
 
 
 def iterate(
@@ -116,7 +107,7 @@ def iterate(
         g = sample_patch(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
         whole = on_cpu and inside(warp, reference.grid.box, size).all()
         visible = None if whole else inside(warp, reference.grid.pixels, size)
-        counted = counting(reference, visible, trusted)
+        counted = counted_pixels(reference, visible, trusted)
         seen = reference if counted is None else restrict(reference, counted)
         increment = seen.criterion.step(seen, g).to(state.pose.dtype)  # eq. (9)
         if counted is not None:

@@ -221,8 +221,8 @@ def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = 
     Infinite or NaN where the texture leaves a direction open."""
     power = reference.noise.power
     most = max(NOISE_SHARE, 1 - CHANCE / reference.grid.pixels.shape[1] ** 0.5)
-    share: Tensor = normal.noise_share * (power if variance is None else torch.minimum(power, variance))
-    return share / most
+    share = normal.noise_share * (power if variance is None else torch.minimum(power, variance))
+    return share.div(most)
 
 
 def unknown(covariance: Tensor) -> Tensor:
