@@ -44,10 +44,9 @@ def mechanism(folder: Path) -> list[tuple[str, ...]]:
     truth = facts(folder)
     bodies = truth["bodies"].values()
     outlines = tuple(tuple(map(tuple, body["mask_polygon"])) for body in bodies)
-    centers, size, mask = choose_templates(
-        TrackJob(input="", centers=tuple(tuple(body["centre_px"]) for body in bodies), polygons=outlines)
-    )
     video = frames(folder)
+    job = TrackJob(input="", centers=tuple(tuple(body["centre_px"]) for body in bodies), polygons=outlines)
+    centers, size, mask, *_ = choose_templates(job, video[0])
     track = Tracker(video[0], centers, size, mask=mask).track_sequence(video[1:])
     rows = []
     for b, name in enumerate(truth["bodies"]):
