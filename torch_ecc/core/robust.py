@@ -99,13 +99,13 @@ def solve(
         doubted, plain = doubted.at(doubtful), each(lambda value: value[doubtful], plain)
         uneven, doubtful = uneven[doubtful], doubtful[doubtful]
     plain = plain._replace(trust=torch.ones_like(plain.sums[:, 0]))
-    again, fits = solved_again(doubted, start, plain)
+    match = torch.maximum(correlation(plain.normal, plain.total), detrended(plain.normal, plain.total))
+    familiar = match >= FAMILIAR * doubted.usual
+    again, fits = solved_again(doubted, start, plain, familiar)
     # Noise may have grown in all of the patch, or light be another: then least squares is right, and leaving out most
     # of it is not.
     most = again.normal.total >= LEAST_COVERAGE * again.sums[:, 0].sum(1)
-    match = torch.maximum(correlation(plain.normal, plain.total), detrended(plain.normal, plain.total))
-    strange = match < FAMILIAR * doubted.usual
-    again = chosen(doubtful & (uneven | fits) & (most | strange), again, plain)
+    again = chosen(doubtful & (uneven | fits) & (most | ~familiar), again, plain)
     found = found._replace(trust=torch.ones_like(found.sums[:, 0]))
     return each(lambda old, new: old.index_copy(0, doubted.which, new), found, again)
 
@@ -124,9 +124,12 @@ def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
     return ~(ratio <= OUTLIER).all(1)
 
 
-def solved_again(doubted: Doubted, start: Tensor, plain: Solution) -> tuple[Solution, Tensor]:
+def solved_again(doubted: Doubted, start: Tensor, plain: Solution, familiar: Tensor) -> tuple[Solution, Tensor]:
     """The best, and whether it fits (n,), of what trust leads to that begins with the residuals of least squares, or
-    with those under a median fit, at the ``start`` (B, 3) or where least squares has come to, and has not slid away."""
+    with those under a median fit, at the ``start`` (B, 3) or where least squares has come to, and has not slid away.
+
+    Where the ``plain`` answer looks ``familiar`` (n,) and the first trial is no better, no other is made.
+    """
     there = start.index_copy(0, doubted.which, plain.pose)
     here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
@@ -140,7 +143,8 @@ def solved_again(doubted: Doubted, start: Tensor, plain: Solution) -> tuple[Solu
         better = (price < least) & near
         best = chosen(better, found, best)
         least, fits = torch.where(better, price, least), torch.where(better, well, fits)
-        if is_cpu(start.device) and bool(fits.all()):
+        familiar = familiar & ~better
+        if is_cpu(start.device) and bool((fits | familiar).all()):
             break
     return best, fits
 
