@@ -33,9 +33,10 @@ FIRST_SLIP = 1.0  # to 0.3 px; before the solve by more
 LARGEST_SLIP = 0.5  # where all do, as of blur, nothing need cover any of them
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
-ROUNDS = 5
+ROUNDS = 8
 CLEARLY_LESS = 0.9  # of the cost of least squares: where all edges fit worse, as by blur, leaving them out gains little
 FITS = 1.4  # median excess: nothing else is tried
+BRIGHTER = 2.0  # times the gain of least squares
 FAMILIAR = 0.9  # of the usual score: least squares that reaches it has found the template
 BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
 SETTLED = 0.01  # of the template's weight: trust changes no more
@@ -119,8 +120,7 @@ def unusual(reference: Reference, found: Solution, usual: Tensor) -> Tensor:
 
 def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
     """Which templates (n,) have blocks that fit far worse than others."""
-    most = Scale(doubted.floor + inf, torch.full_like(doubted.floor, LARGEST_SLIP))
-    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
+    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], any_scale(doubted))
     return ~(ratio <= OUTLIER).all(1)
 
 
@@ -133,12 +133,13 @@ def solved_again(doubted: Doubted, start: Tensor, plain: Solution, familiar: Ten
     there = start.index_copy(0, doubted.which, plain.pose)
     here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
-    first = compared(doubted, variance, seen, usual_scale(doubted, plain, plain.gain.unsqueeze(1), SLIP))
-    best, (least, fits) = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain)
+    first = usual_scale(doubted, plain.gain, SLIP), compared(doubted, variance, seen, any_scale(doubted))[1]
+    best, (least, fits) = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain, plain.gain)
+    brightest = BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
     least = CLEARLY_LESS * least
     for place, begin in ((there, first), (start, None), (there, None)):
         found = reweighted(doubted, place, begin or median_look(doubted, place))
-        price, well = cost(doubted, found)
+        price, well = cost(doubted, found, found.gain.minimum(brightest))
         near = torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < BASIN
         better = (price < least) & near
         best = chosen(better, found, best)
@@ -149,11 +150,11 @@ def solved_again(doubted: Doubted, start: Tensor, plain: Solution, familiar: Ten
     return best, fits
 
 
-def cost(doubted: Doubted, found: Solution) -> tuple[Tensor, Tensor]:
-    """What is left of templates (n,) when the noise is the usual one: the mean log of the blocks' excess, which asks
-    less of what does not fit at all than of how much fits; and whether most do fit."""
+def cost(doubted: Doubted, found: Solution, gain: Tensor) -> tuple[Tensor, Tensor]:
+    """What is left of templates (n,) when the noise is the usual one under a ``gain`` (n,): the mean log of the blocks'
+    excess, which asks less of what does not fit at all than of how much fits; and whether most do fit."""
     seen = found.sums[:, 0]
-    scale = usual_scale(doubted, found, found.gain.unsqueeze(1), LEAST_SLIP)
+    scale = usual_scale(doubted, gain, LEAST_SLIP)
     ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(min=1).nan_to_num(inf, inf)
     value = (ratio.log() * seen).sum(1) / seen.sum(1).clamp(min=LEAST)
     fits = weighted_median(ratio, seen)[:, 0] < FITS
@@ -164,7 +165,7 @@ def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:
     """Scale and excess (n, blocks) under a median fit at ``place`` (B, 3)."""
     look = doubted.solve(place, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
     variance, gain = median_fit(look.sums, doubted.blocks)
-    return compared(doubted, variance, look.sums[:, 0], usual_scale(doubted, look, gain, FIRST_SLIP))
+    return compared(doubted, variance, look.sums[:, 0], usual_scale(doubted, gain[:, 0], FIRST_SLIP))
 
 
 def reweighted(doubted: Doubted, place: Tensor, first: tuple[Scale, Tensor]) -> Solution:
@@ -184,9 +185,15 @@ def reweighted(doubted: Doubted, place: Tensor, first: tuple[Scale, Tensor]) -> 
     return found._replace(trust=before)
 
 
-def usual_scale(doubted: Doubted, found: Solution, gain: Tensor, slip: float) -> Scale:
-    """The scale of templates seen with a ``gain`` (n, 1) if their noise is the usual one."""
-    noise = usual_variance(found.normal, gain[:, 0], doubted.usual).to(doubted.floor.dtype)
+def any_scale(doubted: Doubted) -> Scale:
+    """As large as any."""
+    return Scale(doubted.floor + inf, torch.full_like(doubted.floor, LARGEST_SLIP))
+
+
+def usual_scale(doubted: Doubted, gain: Tensor, slip: float) -> Scale:
+    """The scale of templates seen with a ``gain`` (n,) if their noise is the usual one."""
+    normal = each(lambda value: value[doubted.which], doubted.reference.normal)
+    noise = usual_variance(normal, gain, doubted.usual).to(doubted.floor.dtype)
     return Scale(noise.unsqueeze(1).maximum(doubted.floor), torch.full_like(doubted.floor, slip))
 
 

@@ -25,7 +25,7 @@ from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywher
 from torch_ecc.search.nearby import Nearby
 
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
-ANYWHERE_MARGIN = (3.0, 0.03)  # (a, b): a place of score s may be the template's if 1 - s <= a (1 - s_usual) + b
+ANYWHERE_MARGIN = (2.0, 0.02)  # (a, b): a place of score s may be the template's if 1 - s <= a (1 - s_usual) + b
 AT_ONCE = 8  # templates searched for in the whole of one frame; the others in turn
 NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
