@@ -342,7 +342,7 @@ def test_damaged_frames_are_rows(tmp_path):
         assert (done.frames, done.damaged) == (8, 0 if name == "good" else 2)
     good, bad = track_of(tmp_path / "good"), track_of(tmp_path / "bad")
     np.testing.assert_allclose(bad["pose"][[1, 2, 4, 6, 7]], good["pose"][[1, 2, 4, 6, 7]], atol=2e-3)
-    np.testing.assert_array_equal(bad["pose"][[3, 5]], bad["pose"][[2, 4]])
+    assert np.isnan(bad["pose"][[3, 5]]).all()
     rows = list(csv.DictReader((tmp_path / "bad" / "track.csv").open()))
     assert [row["status"] for row in rows[::2]] == ["CONVERGED"] * 3 + ["DAMAGED", "CONVERGED", "DAMAGED"] + [
         "CONVERGED"

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_ecc.core.estimate import Estimate, Origin, Status, Track
+from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
 
 ROWS = 20  # templates that are listed; of more the first and last half of that
-WORDS: dict[str, type[IntEnum]] = {"status": Status, "origin": Origin}
+WORDS: dict[str, type[IntEnum]] = {"status": Status, "origin": Origin, "reason": Reason}
 POSE = ("x_px", "y_px", "theta_rad")  # as in track.csv
 _DEG = torch.tensor([1.0, 1.0, 180 / math.pi], dtype=torch.float64)
 

@@ -122,8 +122,10 @@ class Journal:
         table, records = reopen(path, size), reopen(part(folder, _RECORDS), whole)
         return Journal(folder, left.form, left.start, table, records, size, left.frames)
 
-    def append(self, arrays: Mapping[str, NDArray[Any]], status: list[str], frame: Frame, state: bytes) -> None:
-        """One frame more. ValueError if it is not like the first one."""
+    def append(
+        self, arrays: Mapping[str, NDArray[Any]], said: tuple[list[str], ...], frame: Frame, state: bytes
+    ) -> None:
+        """One frame more, with its words for status and reason ``said``. ValueError if it is not like the first one."""
         row = np.zeros((), self._dtype)
         for name in set(self.fields) - {"frame", "time_s"}:
             if arrays[name].shape != row[name].shape:
@@ -136,7 +138,7 @@ class Journal:
             row["time_s"] = np.nan if frame.time_s is None else frame.time_s
         if self.form.state:
             row["state"] = np.void(state)
-        text = self._table.rows(frame, arrays, status).encode()
+        text = self._table.rows(frame, arrays, *said).encode()
         append(self.records_file, row.tobytes())
         append(self.table_file, text)
         # A frame counts from here on: what an interrupt leaves half-written behind these marks is cut off by close().
