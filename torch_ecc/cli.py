@@ -195,7 +195,8 @@ def _report(finished: Any) -> None:
         if lost:
             sentence = Reason.describe(int(finished.last_reason[number]))
             console.print(
-                f"Template {number} was not found in {lost} of {finished.frames} frames. Last frame: {sentence}"
+                f"Template {number} was not found in {lost} of {finished.frames} frames. Last frame: {sentence}",
+                soft_wrap=True,
             )
     if finished.damaged:
         console.print(f"{finished.damaged} of {finished.frames} frames are damaged: track.csv says which and why")

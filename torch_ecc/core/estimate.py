@@ -42,7 +42,8 @@ class Origin(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why a pose is not to be trusted: NONE if, and only if, the status is CONVERGED."""
+    """Why a pose is not to be trusted: NONE if, and only if, the status is CONVERGED. Every other one goes with one
+    status: MOVING with MAX_ITERATIONS, UNSURE and NOISE with LOW_TEXTURE, those from COVERED to AMBIGUOUS with LOST."""
 
     NONE = 0
     MOVING = 1
@@ -86,8 +87,8 @@ _REASONS = {
     Reason.ELSEWHERE: "It slid to another place, where the frame looks less like the template than usual.",
     Reason.AMBIGUOUS: "The best place found may be that of something else that looks like the template.",
     Reason.OUT_OF_VIEW: "Too little of the template lies inside the frame.",
-    Reason.UNSURE: "What is seen has too little texture to fix x, y and theta: sigma is too large.",
-    Reason.NOISE: "What seems to be the template's texture may be its noise.",
+    Reason.UNSURE: "Sigma is too large: too little texture is seen for the noise.",
+    Reason.NOISE: "In some direction nothing but the template's own noise fixes x, y or theta.",
     Reason.DAMAGED: "The frame is damaged, or not like the first one.",
 }
 

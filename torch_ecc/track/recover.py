@@ -80,9 +80,9 @@ def disbelieved(estimate: Estimate, suspects: list[bool], start: Tensor, past: P
 
 
 def ambiguous(estimate: Estimate, index: Tensor) -> Estimate:
-    """The ``estimate`` that tells of those at ``index`` (n,) that have no pose that a look-alike is why."""
-    failed = ~Status.good(estimate.status[index])
-    reason = torch.where(failed, int(Reason.AMBIGUOUS), estimate.reason[index]).to(torch.int8)
+    """The ``estimate`` that tells of those at ``index`` (n,) that are lost that a look-alike is why."""
+    lost = estimate.status[index] == Status.LOST
+    reason = torch.where(lost, int(Reason.AMBIGUOUS), estimate.reason[index]).to(torch.int8)
     return estimate._replace(reason=estimate.reason.index_copy(0, index, reason))
 
 
