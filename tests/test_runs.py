@@ -155,6 +155,15 @@ def test_what_is_resumed_must_be_the_same_run(video, tmp_path):
         Session(job(tmp_path / "video.npy", tmp_path / "out", resume=True)).run()
 
 
+def test_records_of_another_version_are_not_misread(video, tmp_path):
+    stop_at(video, tmp_path, 10)
+    records = tmp_path / "track.records.part"
+    records.write_bytes(records.read_bytes().replace(b"coverage", b"covered_", 1))  # a field of another name
+    with pytest.raises(ValueError, match="was written by another version of torch_ecc; --force starts anew"):
+        Session(job(video, tmp_path, resume=True)).run()
+    assert Session(job(video, tmp_path, force=True)).run().frames == FRAMES
+
+
 def test_resume_without_anything_to_resume_begins(video, whole, tmp_path):
     Session(job(video, tmp_path / "out", resume=True)).run()
     assert_same(tmp_path / "out", whole)

@@ -133,8 +133,8 @@ class Session:
 
     def _left(self, films: list[Pictures]) -> Unfinished | None:
         """What an unfinished run has left to go on with. ValueError if it was another one, or if nobody said so."""
-        left = Unfinished.of(self.folder)
-        if self.job.force or left is None:
+        left = None if self.job.force else Unfinished.of(self.folder)
+        if left is None:
             return None
         if not self.job.resume:
             raise ValueError(

@@ -36,9 +36,9 @@ PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light i
 # The tests of ``decide`` in their order, and what the first one that fails tells.
 VERDICTS = (
     (Status.OUT_OF_VIEW, Reason.OUT_OF_VIEW),  # too little of the template's weight lies in the frame
-    (Status.LOST, Reason.COVERED),  # too little of what lies there is believed
-    (Status.LOST, Reason.UNLIKE),  # it does not look like the template
+    (Status.LOST, Reason.UNLIKE),  # what is believed of it does not look like the template
     (Status.LOST, Reason.INVERTED),  # it looks like its negative
+    (Status.LOST, Reason.COVERED),  # too little of what lies there is believed
     (Status.LOW_TEXTURE, Reason.UNSURE),  # the pose is not observable: sigma is too large
     (Status.LOW_TEXTURE, Reason.NOISE),  # or is what the template's own noise makes it
     (Status.MAX_ITERATIONS, Reason.MOVING),  # it was still moving
@@ -65,7 +65,7 @@ def judge(
     covariance = pose_covariance(reference, normal, variance, of_both / power, axes, scatter, alias)
     visible, believed = seen_and_believed(reference, found)
     unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
-    amounts = torch.stack((visible, believed, match, found.gain, *unobservable, found.error, score), 1)
+    amounts = torch.stack((visible, match, found.gain, believed, *unobservable, found.error, score), 1)
     status, failed = decide(amounts, settings)
     worst, rms = max(status.tolist()) if on_cpu else max(Status), (error / normal.total).sqrt()
     tracked = reason = _zeros(len(pose), pose.device)  # Origin.TRACKED, Reason.NONE
@@ -95,10 +95,8 @@ def explained(
     """Status and reason codes (B,) int8 of templates that have ``failed`` (B,) a test, by what else is known of them,
     as the correlation (B,) of what is believed, the ``match``."""
     status, reason = (_codes(k, failed.device).index_select(0, failed) for k in (0, 1))
-    strange = (reason == Reason.COVERED) & ~(match >= min_score)
-    reason = torch.where(strange, int(Reason.UNLIKE), reason)
-    reason = torch.where((reason == Reason.UNLIKE) & (match < -min_score), int(Reason.INVERTED), reason)
     lost = status == Status.LOST
+    reason = torch.where(lost & (match < -min_score), int(Reason.INVERTED), reason)
     reason = torch.where(lost & without_contrast(reference, found), int(Reason.FLAT), reason)
     textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
     low = textureless & (lost | (status == Status.OUT_OF_VIEW))
@@ -107,11 +105,10 @@ def explained(
 
 
 def without_contrast(reference: Reference, found: Solution) -> Tensor:
-    """Where (B,) all that is in sight is as good as flat."""
-    whole = reference.normal
-    seen, power = found.sums[:, 0].sum(1), found.sums[:, 2].sum(1)
-    least = LEAST_CONTRAST**2 * whole.energy / whole.total
-    flat: Tensor = power <= seen * torch.maximum(least, BARE_NOISE * reference.noise.power)
+    """Where (B,) what is believed is as good as flat."""
+    normal = found.normal
+    most = torch.maximum(LEAST_CONTRAST**2 * normal.energy, BARE_NOISE * reference.noise.power * normal.total)
+    flat: Tensor = found.total[:, 2] <= most
     return flat
 
 
@@ -119,7 +116,7 @@ def without_contrast(reference: Reference, found: Solution) -> Tensor:
 @torch.inference_mode(False)
 def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Which way each amount counts, and how much it has to be at least, (8,) each."""
-    least = settings.min_visible, LEAST_COVERAGE, settings.min_score, torch.finfo(dtype).tiny
+    least = settings.min_visible, settings.min_score, torch.finfo(dtype).tiny, LEAST_COVERAGE
     most = LARGEST_SIGMA**2, 1.0, settings.tolerance
     limit = torch.tensor([*least, *(-m for m in most), inf], dtype=dtype, device=device)
     sign = torch.tensor([1, 1, 1, 1, -1, -1, -1, 1], dtype=dtype, device=device)
