@@ -22,6 +22,8 @@ from torch_ecc.io import TrackWriter
 from torch_ecc.io.table import Table
 
 NAMES = {0: "CONVERGED", 1: "MAX_ITERATIONS", 2: "LOST", 3: "OUT_OF_VIEW"}
+REASONS = {0: "", 1: "MOVING", 2: "COVERED", 3: "OUT_OF_VIEW"}
+WORDS = {"status_names": NAMES, "reason_names": REASONS}
 FINAL = {"track.csv", "track.npz", "summary.json"}
 
 
@@ -34,6 +36,7 @@ class Report(NamedTuple):
     covariance: Tensor
     residual_rms: Tensor
     coverage: Tensor
+    reason: Tensor
 
 
 def report(seed: int = 0, templates: int = 2, *, lost: tuple[int, ...] = ()) -> Report:
@@ -47,7 +50,15 @@ def report(seed: int = 0, templates: int = 2, *, lost: tuple[int, ...] = ()) -> 
         covariance[index] = torch.diag(torch.full((3,), math.inf, dtype=torch.float64))
     score = torch.rand(templates, generator=generator)
     return Report(
-        displacement + 100, displacement, score, status, torch.full((templates,), 4), covariance, 3 * score, score
+        displacement + 100,
+        displacement,
+        score,
+        status,
+        torch.full((templates,), 4),
+        covariance,
+        3 * score,
+        score,
+        status,
     )
 
 
@@ -79,12 +90,15 @@ def test_files_hold_the_reports(tmp_path_factory, frames, templates, fps, calibr
     folder = tmp_path_factory.mktemp("run")
     um = torch.tensor([[0.5, 0.02], [-0.03, 0.4]], dtype=torch.float64) if calibrated else None
     reports = [report(seed + k, templates, lost=(k % templates,) if k % 2 else ()) for k in range(frames)]
-    with TrackWriter(folder, status_names=NAMES, fps=fps, um_matrix=um) as writer:
+    with TrackWriter(folder, **WORDS, fps=fps, um_matrix=um) as writer:
         for item in reports:
             writer.write(item)
     track = np.load(folder / "track.npz")
+    found = torch.stack([item.status for item in reports]).numpy() < 2
     for name in Report._fields:
         stacked = torch.stack([getattr(item, name) for item in reports]).numpy()
+        if name in ("pose", "displacement"):
+            stacked = np.where(found[..., None], stacked, np.nan)  # an old one is none
         np.testing.assert_array_equal(track[name], stacked)
     assert track["displacement"].dtype == track["pose"].dtype == np.float64
     assert dict(zip(track["status_codes"].tolist(), track["status_names"].tolist(), strict=True)) == NAMES
@@ -100,13 +114,16 @@ def check_rows(table: list[dict[str, str]], track: dict[str, np.ndarray], fps: f
     assert [(int(row["frame"]), int(row["template"])) for row in table] == list(np.ndindex(frames, templates))
     for row in table:
         at = int(row["frame"]), int(row["template"])
-        found = {name: float(value) for name, value in row.items() if name not in ("status", "damage")}
+        words = ("status", "reason", "damage")
+        found = {name: float(value or "nan") for name, value in row.items() if name not in words}
+        assert row["reason"] == REASONS[track["reason"][at]]
         pose = [found[name] for name in ("x_px", "y_px", "theta_rad")]
         moved = [found[name] for name in ("dx_px", "dy_px", "dtheta_rad")]
         sigma = [found[name] for name in ("sigma_x_px", "sigma_y_px", "sigma_theta_rad")]
         np.testing.assert_allclose(pose, track["pose"][at], atol=1e-6)
         np.testing.assert_allclose(moved, track["displacement"][at], atol=1e-6)
-        np.testing.assert_allclose(sigma, np.sqrt(np.diag(track["covariance"][at])), rtol=1e-3)
+        variance = np.diag(track["covariance"][at])
+        np.testing.assert_allclose(sigma, np.sqrt(np.where(variance < np.inf, variance, np.nan)), rtol=1e-3)
         assert found["score"] == pytest.approx(track["score"][at], abs=1e-6)
         assert found["residual_rms"] == pytest.approx(track["residual_rms"][at], rel=1e-3)
         assert found["coverage"] == pytest.approx(track["coverage"][at], abs=1e-3)
@@ -120,18 +137,18 @@ def check_rows(table: list[dict[str, str]], track: dict[str, np.ndarray], fps: f
 
 
 def test_columns_carry_their_units(tmp_path):
-    with TrackWriter(tmp_path, status_names=NAMES, fps=10.0, um_matrix=torch.eye(2)) as writer:
+    with TrackWriter(tmp_path, **WORDS, fps=10.0, um_matrix=torch.eye(2)) as writer:
         writer.write(report())
     assert (tmp_path / "track.csv").read_text().splitlines()[0] == (
         "frame,template,time_s,x_px,y_px,theta_rad,dx_px,dy_px,dtheta_rad,dx_um,dy_um,"
-        "sigma_x_px,sigma_y_px,sigma_theta_rad,score,status,iterations,residual_rms,coverage,damage"
+        "sigma_x_px,sigma_y_px,sigma_theta_rad,score,status,reason,iterations,residual_rms,coverage,damage"
     )
 
 
 def test_summary(tmp_path):
     given_settings = {"size": (31, 31), "input": Path("a.mp4"), "levels": 2, "limit": math.inf, "mask": None}
     um = torch.tensor([[0.3, 0.0], [0.4, 2.0]], dtype=torch.float64)
-    with TrackWriter(tmp_path, status_names=NAMES, fps=20.0, um_matrix=um, settings=given_settings) as writer:
+    with TrackWriter(tmp_path, **WORDS, fps=20.0, um_matrix=um, settings=given_settings) as writer:
         for k in range(10):
             writer.write(report(k, lost=(1,) if k >= 4 else (0,) if k == 3 else ()))
     found = summary(tmp_path)
@@ -152,7 +169,7 @@ def test_summary(tmp_path):
 
 
 def test_doubtful_is_not_lost(tmp_path):
-    with TrackWriter(tmp_path, status_names=NAMES) as writer:
+    with TrackWriter(tmp_path, **WORDS) as writer:
         writer.write(report()._replace(status=torch.tensor([1, 3], dtype=torch.int8)))
     assert [template["lost_frames"] for template in summary(tmp_path)["per_template"]] == [0, 1]
 
@@ -161,7 +178,7 @@ def test_doubtful_is_not_lost(tmp_path):
 
 
 def run_into(folder: Path, error: BaseException | None, frames: int = 3) -> None:
-    with TrackWriter(folder, status_names=NAMES) as writer:
+    with TrackWriter(folder, **WORDS) as writer:
         for k in range(frames):
             writer.write(report(k))
         assert names(folder) == ({"track.csv.part", "track.records.part"} if frames else set())
@@ -204,7 +221,7 @@ def test_nothing_is_created_before_the_first_record(tmp_path, error):
 @pytest.mark.parametrize("frames", [0, 3])
 def test_interrupt_in_the_middle_of_a_frame(tmp_path, monkeypatch, frames):
     """Files stay in step: the frame that was being written is in neither."""
-    with TrackWriter(tmp_path, status_names=NAMES) as writer:
+    with TrackWriter(tmp_path, **WORDS) as writer:
         for k in range(frames):
             writer.write(report(k))
         monkeypatch.setattr(Table, "rows", interrupt)
@@ -227,8 +244,8 @@ def interrupt(*_: object) -> str:
 
 def test_a_killed_process_leaves_parts_only(tmp_path):
     code = (
-        "import os, sys; sys.path.insert(0, sys.argv[1]); from test_io_writing import NAMES, TrackWriter, report\n"
-        "with TrackWriter(sys.argv[2], status_names=NAMES) as writer:\n"
+        "import os, sys; sys.path.insert(0, sys.argv[1]); from test_io_writing import WORDS, TrackWriter, report\n"
+        "with TrackWriter(sys.argv[2], **WORDS) as writer:\n"
         "    for k in range(5): writer.write(report(k))\n"
         "    os._exit(9)"
     )
@@ -242,7 +259,7 @@ def test_a_killed_process_leaves_parts_only(tmp_path):
 def test_an_earlier_run_stays_until_the_new_one_is_whole(tmp_path):
     run_into(tmp_path, None, frames=5)
     before = {name: (tmp_path / name).read_bytes() for name in FINAL}
-    with TrackWriter(tmp_path, status_names=NAMES) as writer:
+    with TrackWriter(tmp_path, **WORDS) as writer:
         writer.write(report())
         assert {name: (tmp_path / name).read_bytes() for name in FINAL} == before
     assert names(tmp_path) == FINAL
@@ -251,7 +268,7 @@ def test_an_earlier_run_stays_until_the_new_one_is_whole(tmp_path):
 
 def test_memory_does_not_grow_with_the_length(tmp_path):
     item = report(templates=8)
-    with TrackWriter(tmp_path, status_names=NAMES) as writer:
+    with TrackWriter(tmp_path, **WORDS) as writer:
         writer.write(item)
         tracemalloc.start()
         try:
@@ -276,13 +293,13 @@ def test_memory_does_not_grow_with_the_length(tmp_path):
 )
 def test_bad_options(tmp_path, options, message):
     with pytest.raises(ValueError, match=message):
-        TrackWriter(tmp_path, status_names=NAMES, **options)
+        TrackWriter(tmp_path, **WORDS, **options)
 
 
 def test_the_folder_must_be_one(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(ValueError, match=r"TrackWriter: out_dir must be a folder, .*file is a file"):
-        TrackWriter(tmp_path / "file", status_names=NAMES)
+        TrackWriter(tmp_path / "file", **WORDS)
 
 
 @pytest.mark.parametrize(
@@ -294,12 +311,13 @@ def test_the_folder_must_be_one(tmp_path):
             report()._replace(status=torch.tensor([0, 7])),
             r"record.status has the code 7, status_names has \[0, 1, 2, 3\]",
         ),
+        (report()._replace(reason=torch.tensor([9, 0])), r"record.reason has the code 9, reason_names has"),
         (report(templates=3), "record must have 2 templates as before, got 3"),
     ],
 )
 def test_bad_records(tmp_path, record, message):
     def run() -> None:
-        with TrackWriter(tmp_path, status_names=NAMES) as writer:
+        with TrackWriter(tmp_path, **WORDS) as writer:
             writer.write(report())
             writer.write(record)
 

@@ -31,6 +31,7 @@ def estimate(count: int = 3, shift: float = 0.0) -> Estimate:
         "iterations": torch.full((count,), 4),
         "covariance": covariance,
         "origin": torch.full((count,), int(Origin.NEARBY), dtype=torch.int8),
+        "reason": torch.zeros(count, dtype=torch.int8),
     }
     return Estimate(**{name: fields.get(name, torch.full((count,), 0.5)) for name in Estimate._fields})
 

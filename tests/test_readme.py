@@ -72,3 +72,8 @@ def test_names_and_options_exist():
 def test_every_status_is_explained():
     for status in te.Status:
         assert f"`{status.name}`" in README
+
+
+def test_every_reason_is_explained():
+    for reason in te.Reason:
+        assert f"`{reason.name}`" in README

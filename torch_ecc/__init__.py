@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
     from torch_ecc.core import pose
     from torch_ecc.core.align import align
     from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
-    from torch_ecc.core.estimate import Estimate, Origin, Status, Track
+    from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
     from torch_ecc.core.patches import texture
     from torch_ecc.core.reference import Reference, prepare
     from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
@@ -28,7 +28,7 @@ _PLACES = {
     "core.pose": ["pose"],
     "core.align": ["align"],
     "core.criteria": ["ECC", "SSD", "Criterion", "PaperECC"],
-    "core.estimate": ["Estimate", "Origin", "Status", "Track"],
+    "core.estimate": ["Estimate", "Origin", "Reason", "Status", "Track"],
     "core.patches": ["texture"],
     "core.reference": ["Reference", "prepare"],
     "records.calibration": ["Calibration", "CalibrationFit", "calibrate"],
@@ -48,6 +48,7 @@ __all__ = [
     "Locator",
     "Origin",
     "PaperECC",
+    "Reason",
     "Reference",
     "SequenceError",
     "Status",

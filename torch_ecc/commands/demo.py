@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 from torch import Tensor
 
-from torch_ecc.commands.track import STATUS_NAMES
+from torch_ecc.commands.track import REASON_NAMES, STATUS_NAMES
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.io import OverlayWriter, TrackWriter
 from torch_ecc.plots import plot_track
@@ -96,8 +96,9 @@ def run_demo(out: Path, frames: int, advance: Callable[[int, int], None]) -> Dem
 def _open(stack: ExitStack, folder: Path, tracker: Tracker) -> tuple[TrackWriter, OverlayWriter]:
     um = Calibration(UM_PER_PX).matrix(torch.zeros(1, dtype=torch.float64))[:2, :2]
     settings = {"criterion": str(tracker.criterion), "size": SIZE, "um_per_px": UM_PER_PX, **asdict(tracker.settings)}
-    track = TrackWriter(folder, status_names=STATUS_NAMES, fps=25.0, um_matrix=um, settings=settings)
-    overlay = OverlayWriter(folder, shapes=[(SIZE, SIZE)], status_names=STATUS_NAMES, fps=25.0, um_matrix=um)
+    words: dict[str, Any] = {"status_names": STATUS_NAMES, "fps": 25.0, "um_matrix": um}
+    track = TrackWriter(folder, reason_names=REASON_NAMES, settings=settings, **words)
+    overlay = OverlayWriter(folder, shapes=[(SIZE, SIZE)], **words)
     return stack.enter_context(track), stack.enter_context(overlay)
 
 

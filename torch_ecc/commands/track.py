@@ -18,7 +18,7 @@ from torch import Tensor
 from torch_ecc.commands.jobs import TrackJob, span
 from torch_ecc.commands.templates import Templates, choose_templates, read_templates, refuse_doubt
 from torch_ecc.core.ambient import threads_for
-from torch_ecc.core.estimate import Status
+from torch_ecc.core.estimate import Reason, Status
 from torch_ecc.io import Frame, OverlayWriter, TrackWriter, open_frames
 from torch_ecc.io.beside import ahead
 from torch_ecc.io.journal import Unfinished
@@ -31,6 +31,7 @@ from torch_ecc.track.tracker import Tracker
 Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 
 STATUS_NAMES = {int(code): code.name for code in Status}
+REASON_NAMES = {int(code): code.word for code in Reason}
 RESULTS = (*FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
 NOT_OF_THE_RESULT = ("out", "force", "resume")
 CONSTANT = ("template", "mask", "centre", "first")  # of a tracker's state
@@ -38,12 +39,14 @@ CONSTANT = ("template", "mask", "centre", "first")  # of a tracker's state
 
 class Finished(NamedTuple):
     """What became of a run: ``frames`` done, of which so many ``damaged``, how many each template was lost in of the
-    others and its last status (R,), the folder, and whether it was stopped from the keyboard or by a signal."""
+    others and what speaks against its last pose (R,), how many rows each reason stands in, in the order of Reason, the
+    folder, and whether it was stopped from the keyboard or by a signal."""
 
     frames: int
     damaged: int
     lost: NDArray[np.int64]
-    last_status: NDArray[np.int8]
+    last_reason: NDArray[np.int8]
+    reasons: NDArray[np.int64]
     folder: Path
     interrupted: bool
 
@@ -121,7 +124,7 @@ class Session:
                 self._remove_old({film.film.name for film in films})
             if isinstance(stopped, ValueError):
                 raise stopped
-        return Finished(run.done, run.damaged, run.lost, run.last, self.folder, stopped is not None)
+        return Finished(*run.counts, self.folder, stopped is not None)
 
     def _remove_old(self, films: set[str]) -> None:
         """What a result before had and this one does not."""
@@ -130,8 +133,8 @@ class Session:
 
     def _left(self, films: list[Pictures]) -> Unfinished | None:
         """What an unfinished run has left to go on with. ValueError if it was another one, or if nobody said so."""
-        left = Unfinished.of(self.folder)
-        if self.job.force or left is None:
+        left = None if self.job.force else Unfinished.of(self.folder)
+        if left is None:
             return None
         if not self.job.resume:
             raise ValueError(
@@ -156,6 +159,7 @@ class Session:
         return TrackWriter(
             self.folder,
             status_names=STATUS_NAMES,
+            reason_names=REASON_NAMES,
             fps=self.source.fps,
             um_matrix=self._um_matrix(),
             settings=self.settings,
@@ -186,12 +190,11 @@ class Session:
 
 
 class _Run:
-    """The files and the counts of a run: ``done`` frames, so many ``damaged``, how many each template was ``lost`` in
-    of the others, and its ``last`` status."""
+    """The files and the counts of a run, as ``Finished`` has them."""
 
     def __init__(self, tracker: Tracker, track: TrackWriter, films: list[Pictures], *, stop_at_damage: bool) -> None:
         self.tracker, self.track, self.films, self.stop_at_damage = tracker, track, films, stop_at_damage
-        self.done, self.damaged = 0, 0
+        self.done, self.damaged, self.reasons = 0, 0, np.zeros(len(Reason), np.int64)
         self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
         # What the next frame depends on: all of it goes into the journal with every frame.
         self._state = [part for name, part in tracker.named_buffers() if name not in CONSTANT]
@@ -222,11 +225,17 @@ class _Run:
         self.track.write(estimate, frame, b"".join(view.tobytes() for view in views))
         for film in self.films:
             film.write(frame, estimate)
-        self._count(estimate.status.cpu().numpy()[None])
+        self._count(*(code.cpu().numpy()[None] for code in (estimate.status, estimate.reason)))
 
-    def _count(self, status: NDArray[np.int8]) -> None:
-        """Frames more with ``status`` (F, R)."""
-        self.done, self.last = self.done + len(status), status[-1]
+    @property
+    def counts(self) -> tuple[int, int, NDArray[np.int64], NDArray[np.int8], NDArray[np.int64]]:
+        """The first fields of ``Finished``."""
+        return self.done, self.damaged, self.lost, self.last, self.reasons
+
+    def _count(self, status: NDArray[np.int8], reason: NDArray[np.int8]) -> None:
+        """Frames more with ``status`` and ``reason`` (F, R)."""
+        self.done, self.last = self.done + len(status), reason[-1]
+        self.reasons += np.bincount(reason.ravel(), minlength=len(Reason))
         if status.max() > Status.MAX_ITERATIONS:
             damaged = status == Status.DAMAGED
             self.damaged += int(damaged[:, 0].sum())
@@ -243,7 +252,7 @@ class _Run:
         status = np.array(records["status"])
         for film in self.films:
             film.go_on(np.array(records["pose"]), status <= Status.MAX_ITERATIONS)
-        self._count(status)
+        self._count(status, np.array(records["reason"]))
 
 
 def with_picture(frame: Frame) -> Frame:

@@ -41,6 +41,34 @@ class Origin(IntEnum):
     ANYWHERE = 2  # by a search of the whole frame
 
 
+class Reason(IntEnum):
+    """Why a pose is not to be trusted: NONE if, and only if, the status is CONVERGED. Every other one goes with one
+    status: MOVING with MAX_ITERATIONS, UNSURE and NOISE with LOW_TEXTURE, those from COVERED to AMBIGUOUS with LOST."""
+
+    NONE = 0
+    MOVING = 1
+    COVERED = 2
+    UNLIKE = 3
+    INVERTED = 4
+    FLAT = 5
+    ELSEWHERE = 6
+    AMBIGUOUS = 7
+    OUT_OF_VIEW = 8
+    UNSURE = 9
+    NOISE = 10
+    DAMAGED = 11
+
+    @property
+    def word(self) -> str:
+        """As tables have it: empty for NONE."""
+        return self.name if self else ""
+
+    @staticmethod
+    def describe(code: int) -> str:
+        """A sentence for people."""
+        return _REASONS[Reason(int(code))]
+
+
 _SENTENCES = {
     Status.CONVERGED: "The pose is good to the requested tolerance.",
     Status.MAX_ITERATIONS: "The pose was still moving by more than the tolerance when the iterations ran out.",
@@ -48,6 +76,20 @@ _SENTENCES = {
     Status.OUT_OF_VIEW: "Too little of the template lies inside the frame; the last good pose is kept.",
     Status.LOW_TEXTURE: "The template has too little texture to fix x, y and theta; choose another patch.",
     Status.DAMAGED: "The frame is damaged, or not like the first one; the last good pose is kept.",
+}
+_REASONS = {
+    Reason.NONE: "Nothing speaks against the pose.",
+    Reason.MOVING: "The pose was still moving by more than the tolerance when the iterations ran out.",
+    Reason.COVERED: "Less than half of the template is believed: something covers it, or it is not there.",
+    Reason.UNLIKE: "The frame does not look like the template where it was looked for: it is covered, or gone.",
+    Reason.INVERTED: "The frame looks like the template's negative.",
+    Reason.FLAT: "Next to no contrast is there: too dark, too bright, far out of focus, or covered whole.",
+    Reason.ELSEWHERE: "It slid to another place, where the frame looks less like the template than usual.",
+    Reason.AMBIGUOUS: "The best place found may be that of something else that looks like the template.",
+    Reason.OUT_OF_VIEW: "Too little of the template lies inside the frame.",
+    Reason.UNSURE: "Sigma is too large: too little texture is seen for the noise.",
+    Reason.NOISE: "In some direction nothing but the template's own noise fixes x, y or theta.",
+    Reason.DAMAGED: "The frame is damaged, or not like the first one.",
 }
 
 
@@ -92,7 +134,8 @@ class Estimate(NamedTuple):
     zero-mean normalised correlation in [-1, 1]; ``status`` (R,) int8, see Status; ``iterations`` (R,);
     ``covariance`` (R, 3, 3) of the pose, infinite on the diagonal where the status is a failure; ``residual_rms``
     (R,) in grey levels of the frame; ``origin`` (R,) int8, see Origin: a search's only where it gave the pose;
-    ``coverage`` (R,) share of the template's weight in sight that the solve believed, in [0, 1].
+    ``coverage`` (R,) share of the template's weight in sight that the solve believed, in [0, 1]; ``reason`` (R,) int8,
+    see Reason: what speaks against the pose.
     """
 
     pose: Tensor
@@ -104,6 +147,7 @@ class Estimate(NamedTuple):
     residual_rms: Tensor
     origin: Tensor
     coverage: Tensor
+    reason: Tensor
 
     @property
     def sigma(self) -> Tensor:

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_ecc.core.estimate import Estimate, Origin, Status, Track
+from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
 
 ROWS = 20  # templates that are listed; of more the first and last half of that
-WORDS: dict[str, type[IntEnum]] = {"status": Status, "origin": Origin}
+WORDS: dict[str, type[IntEnum]] = {"status": Status, "origin": Origin, "reason": Reason}
 POSE = ("x_px", "y_px", "theta_rad")  # as in track.csv
 _DEG = torch.tensor([1.0, 1.0, 180 / math.pi], dtype=torch.float64)
 
@@ -54,7 +54,8 @@ def track_text(track: Track) -> str:
 
 
 def to_frame(estimate: Estimate) -> Any:
-    """A pandas.DataFrame of one row per template (and frame), by the columns of track.csv and every other field.
+    """A pandas.DataFrame of one row per template (and frame), by the columns of track.csv and every other field. As
+    there, nothing that draws it takes an old pose for one: it is NaN.
 
     ModuleNotFoundError, in words, where there is no pandas.
     """
@@ -67,7 +68,8 @@ def to_frame(estimate: Estimate) -> Any:
     index = torch.meshgrid(*(torch.arange(n) for n in shape), indexing="ij")
     columns: dict[str, Any] = dict(zip(("frame", "template")[-len(shape) :], (i.flatten() for i in index), strict=True))
     for prefix, values in (("", e.pose), ("d", e.displacement), ("sigma_", e.sigma)):
-        columns |= {f"{prefix}{name}": values[..., k].flatten() for k, name in enumerate(POSE)}
+        new = torch.where(e.ok[..., None], values, math.nan)
+        columns |= {f"{prefix}{name}": new[..., k].flatten() for k, name in enumerate(POSE)}
     for name, value in e._asdict().items():
         if value.shape == shape:
             columns[name] = value.flatten()
@@ -124,10 +126,12 @@ def aligned(head: Sequence[str], rows: list[list[str]], count: int) -> str:
 
 
 def _word(estimate: Estimate, k: int) -> str:
-    """The status of one template, where it was found if not by tracking alone, and what an old pose is."""
-    status, origin = Status(int(estimate.status[k])), Origin(int(estimate.origin[k]))
+    """The status of one template, where it was found if not by tracking alone, and what an old pose is and why."""
+    status, reason = Status(int(estimate.status[k])), Reason(int(estimate.reason[k]))
+    origin = Origin(int(estimate.origin[k]))
     if not bool(estimate.ok[k]):
-        return f"{status.name}, the last good pose"
+        why = f" ({reason.name})" if reason and reason.name != status.name else ""
+        return f"{status.name}{why}, the last good pose"
     return status.name if origin is Origin.TRACKED else f"{status.name}, found {origin.name}"
 
 

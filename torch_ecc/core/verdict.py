@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.criteria import safe_inverse
-from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
@@ -29,18 +29,20 @@ NOISE_SHARE = 0.6  # of the information in some direction is the template's nois
 CHANCE = 42.0  # over the square root of the number of pixels: noise as such is within so much of all of it
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 DOUBTFUL_SHARE = 0.8  # of the noise that there may be, as the likely reason why a template was not found
+LEAST_CONTRAST = 0.1  # of the template's: what has less is flat, and so is what has no more than
+BARE_NOISE = 2.0  # times the template's noise
 PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light is rounding
 
 # The tests of ``decide`` in their order, and what the first one that fails tells.
 VERDICTS = (
-    Status.OUT_OF_VIEW,  # too little of the template's weight lies in the frame
-    Status.LOST,  # too little of what lies there is believed
-    Status.LOST,  # it does not look like the template
-    Status.LOST,  # it looks like its negative
-    Status.LOW_TEXTURE,  # the pose is not observable: sigma is too large
-    Status.LOW_TEXTURE,  # or is what the template's own noise makes it
-    Status.MAX_ITERATIONS,  # it was still moving
-    Status.CONVERGED,  # no test fails
+    (Status.OUT_OF_VIEW, Reason.OUT_OF_VIEW),  # too little of the template's weight lies in the frame
+    (Status.LOST, Reason.UNLIKE),  # what is believed of it does not look like the template
+    (Status.LOST, Reason.INVERTED),  # it looks like its negative
+    (Status.LOST, Reason.COVERED),  # too little of what lies there is believed
+    (Status.LOW_TEXTURE, Reason.UNSURE),  # the pose is not observable: sigma is too large
+    (Status.LOW_TEXTURE, Reason.NOISE),  # or is what the template's own noise makes it
+    (Status.MAX_ITERATIONS, Reason.MOVING),  # it was still moving
+    (Status.CONVERGED, Reason.NONE),  # no test fails
 )
 
 
@@ -63,47 +65,69 @@ def judge(
     covariance = pose_covariance(reference, normal, variance, of_both / power, axes, scatter, alias)
     visible, believed = seen_and_believed(reference, found)
     unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
-    status = decide(torch.stack((visible, believed, match, found.gain, *unobservable, found.error, score), 1), settings)
-    rms = (error / normal.total).sqrt()
-    if not on_cpu or max(status.tolist()) > Status.MAX_ITERATIONS:
-        textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
-        low = textureless & ((status == Status.LOST) | (status == Status.OUT_OF_VIEW))
-        status = torch.where(low, int(Status.LOW_TEXTURE), status).to(torch.int8)
+    amounts = torch.stack((visible, match, found.gain, believed, *unobservable, found.error, score), 1)
+    status, failed = decide(amounts, settings)
+    worst, rms = max(status.tolist()) if on_cpu else max(Status), (error / normal.total).sqrt()
+    tracked = reason = _zeros(len(pose), pose.device)  # Origin.TRACKED, Reason.NONE
+    if worst > Status.CONVERGED:
+        status, reason = explained(reference, found, failed, match, settings.min_score)
+    if worst > Status.MAX_ITERATIONS:
         unfitted = ~normal.noise_share.isfinite()  # singular: all that is in sight of the patch is left
         rms = torch.where(unfitted, (total[:, 2] / normal.total.clamp(min=LEAST)).sqrt(), rms)
         good = Status.good(status)
         pose = torch.where(good[:, None], pose, start)
         covariance = torch.where(good[:, None, None], covariance, unknown(covariance))
-    moved = pose - (start if origin is None else origin)
-    return Estimate(
-        pose,
-        moved,
-        score,
-        status,
-        found.iterations,
-        covariance,
-        rms,
-        _tracked(len(pose), pose.device).clone(),
-        believed,
-    )
+    moved, last = pose - (start if origin is None else origin), (tracked.clone(), believed, reason.clone())
+    return Estimate(pose, moved, score, status, found.iterations, covariance, rms, *last)
 
 
-def decide(amounts: Tensor, settings: Settings) -> Tensor:
-    """Status codes (B,) int8 from the ``amounts`` (B, 8) that ``VERDICTS`` are about; the last is never passed."""
-    sign, limit, codes = _limits(settings, amounts.dtype, amounts.device)
+def decide(amounts: Tensor, settings: Settings) -> tuple[Tensor, Tensor]:
+    """Status codes (B,) int8 from the ``amounts`` (B, 8) that ``VERDICTS`` are about, the last of which is never
+    passed; and which test (B,) was the first to fail."""
+    sign, limit = _limits(settings, amounts.dtype, amounts.device)
     first = (amounts * sign >= limit).to(torch.int8).argmin(1)  # NaN passes nothing
-    return codes[first]
+    return _codes(0, amounts.device).index_select(0, first), first
+
+
+def explained(
+    reference: Reference, found: Solution, failed: Tensor, match: Tensor, min_score: float
+) -> tuple[Tensor, Tensor]:
+    """Status and reason codes (B,) int8 of templates that have ``failed`` (B,) a test, by what else is known of them,
+    as the correlation (B,) of what is believed, the ``match``."""
+    status, reason = (_codes(k, failed.device).index_select(0, failed) for k in (0, 1))
+    lost = status == Status.LOST
+    reason = torch.where(lost & (match < -min_score), int(Reason.INVERTED), reason)
+    reason = torch.where(lost & without_contrast(reference, found), int(Reason.FLAT), reason)
+    textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
+    low = textureless & (lost | (status == Status.OUT_OF_VIEW))
+    reason = torch.where(low, int(Reason.NOISE), reason).to(torch.int8)
+    return torch.where(low, int(Status.LOW_TEXTURE), status).to(torch.int8), reason
+
+
+def without_contrast(reference: Reference, found: Solution) -> Tensor:
+    """Where (B,) what is believed is as good as flat."""
+    normal = found.normal
+    most = torch.maximum(LEAST_CONTRAST**2 * normal.energy, BARE_NOISE * reference.noise.power * normal.total)
+    flat: Tensor = found.total[:, 2] <= most
+    return flat
 
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Which way each amount counts, how much it has to be at least, and the status codes, (8,) each."""
-    least = settings.min_visible, LEAST_COVERAGE, settings.min_score, torch.finfo(dtype).tiny
+def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Which way each amount counts, and how much it has to be at least, (8,) each."""
+    least = settings.min_visible, settings.min_score, torch.finfo(dtype).tiny, LEAST_COVERAGE
     most = LARGEST_SIGMA**2, 1.0, settings.tolerance
     limit = torch.tensor([*least, *(-m for m in most), inf], dtype=dtype, device=device)
     sign = torch.tensor([1, 1, 1, 1, -1, -1, -1, 1], dtype=dtype, device=device)
-    return sign, limit, torch.tensor(VERDICTS, dtype=torch.int8, device=device)
+    return sign, limit
+
+
+@lru_cache(maxsize=16)
+@torch.inference_mode(False)
+def _codes(column: int, device: torch.device) -> Tensor:
+    """Of ``VERDICTS``: (8,) int8."""
+    return torch.tensor([int(verdict[column]) for verdict in VERDICTS], dtype=torch.int8, device=device)
 
 
 def seen_and_believed(reference: Reference, found: Solution) -> tuple[Tensor, Tensor]:
@@ -238,6 +262,6 @@ def _infinite(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _tracked(count: int, device: torch.device) -> Tensor:
-    """The origin (B,) of poses that no search has given."""
-    return torch.full((count,), int(Origin.TRACKED), dtype=torch.int8, device=device)
+def _zeros(count: int, device: torch.device) -> Tensor:
+    """The codes (B,) of poses that no search has given, and that nothing speaks against."""
+    return torch.zeros(count, dtype=torch.int8, device=device)

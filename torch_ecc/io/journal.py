@@ -62,7 +62,8 @@ class Unfinished(NamedTuple):
 
     @staticmethod
     def of(folder: Path) -> Unfinished | None:
-        """What is left in ``folder``; None if nothing is that one could go on with."""
+        """What is left in ``folder``; None if nothing is that one could go on with. ValueError if its records are not
+        laid out as ours."""
         path = part(folder, _RECORDS)
         if not path.is_file() or path.is_symlink():
             return None
@@ -70,9 +71,11 @@ class Unfinished(NamedTuple):
             try:
                 length = int(file.read(_HEADER))
                 told = json.loads(file.read(length))
-                form, settings = Form(*told["form"]), dict(told["settings"])
+                form, settings, layout = Form(*told["form"]), dict(told["settings"]), told.get("layout")
             except (ValueError, TypeError, KeyError):  # killed before the first frame
                 return None
+        if layout != str(form.dtype):
+            raise ValueError(f"resume: {path} was written by another version of torch_ecc; --force starts anew")
         start = _HEADER + length
         whole = (path.stat().st_size - start) // form.dtype.itemsize
         frames = min(whole, (_lines(_rows(folder)) - 1) // form.templates)
@@ -102,7 +105,7 @@ class Journal:
     @staticmethod
     def begin(folder: Path, form: Form, settings: Mapping[str, Any]) -> Journal:
         """New files."""
-        told = json.dumps({"form": form, "settings": plain(settings)}).encode()
+        told = json.dumps({"form": form, "layout": str(form.dtype), "settings": plain(settings)}).encode()
         header, title = b"%0*d" % (_HEADER, len(told)) + told, form.table.header.encode()
         table, records = create(part(folder, _TABLE)), create(part(folder, _RECORDS))
         append(records, header)
@@ -122,8 +125,10 @@ class Journal:
         table, records = reopen(path, size), reopen(part(folder, _RECORDS), whole)
         return Journal(folder, left.form, left.start, table, records, size, left.frames)
 
-    def append(self, arrays: Mapping[str, NDArray[Any]], status: list[str], frame: Frame, state: bytes) -> None:
-        """One frame more. ValueError if it is not like the first one."""
+    def append(
+        self, arrays: Mapping[str, NDArray[Any]], said: tuple[list[str], ...], frame: Frame, state: bytes
+    ) -> None:
+        """One frame more, with its words for status and reason ``said``. ValueError if it is not like the first one."""
         row = np.zeros((), self._dtype)
         for name in set(self.fields) - {"frame", "time_s"}:
             if arrays[name].shape != row[name].shape:
@@ -136,7 +141,7 @@ class Journal:
             row["time_s"] = np.nan if frame.time_s is None else frame.time_s
         if self.form.state:
             row["state"] = np.void(state)
-        text = self._table.rows(frame, arrays, status).encode()
+        text = self._table.rows(frame, arrays, *said).encode()
         append(self.records_file, row.tobytes())
         append(self.table_file, text)
         # A frame counts from here on: what an interrupt leaves half-written behind these marks is cut off by close().

@@ -14,6 +14,8 @@ from torch import Tensor
 
 StatusNames: TypeAlias = Mapping[int, str]
 """The word for each status code, for example ``{0: "CONVERGED", 1: "MAX_ITERATIONS", 2: "LOST"}``."""
+ReasonNames: TypeAlias = Mapping[int, str]
+"""The word for each reason code, empty where a pose can be trusted, for example ``{0: "", 1: "COVERED"}``."""
 
 CONVERGED: Final = "CONVERGED"
 DOUBTFUL: Final = "MAX_ITERATIONS"
@@ -42,6 +44,8 @@ class Record(Protocol):
     def residual_rms(self) -> Tensor: ...  # (R,)
     @property
     def coverage(self) -> Tensor: ...  # (R,)
+    @property
+    def reason(self) -> Tensor: ...  # (R,) integer
 
 
 FIELDS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
@@ -53,6 +57,7 @@ FIELDS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
     "covariance": ("f8", (3, 3)),
     "residual_rms": ("f8", ()),
     "coverage": ("f8", ()),
+    "reason": ("i1", ()),
 }
 """dtype and shape of each field per template."""
 
@@ -74,10 +79,10 @@ def sigma(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
-def words(status: NDArray[np.int8], names: StatusNames) -> list[str]:
-    """The word of each of (R,) codes. ValueError for a code that has none."""
-    codes = [int(code) for code in status]
+def words(values: NDArray[np.int8], names: Mapping[int, str], field: str = "status") -> list[str]:
+    """The word of each of (R,) codes of a ``field``. ValueError for a code that has none."""
+    codes = values.tolist()
     unknown = sorted(set(codes) - set(names))
     if unknown:
-        raise ValueError(f"write: record.status has the code {unknown[0]}, status_names has {sorted(names)}")
+        raise ValueError(f"write: record.{field} has the code {unknown[0]}, {field}_names has {sorted(names)}")
     return [names[code] for code in codes]

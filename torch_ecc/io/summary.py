@@ -14,10 +14,12 @@ import torch
 from numpy.typing import NDArray
 
 from torch_ecc.io.output import append, create
-from torch_ecc.io.records import CONVERGED, DAMAGED, DOUBTFUL, StatusNames
+from torch_ecc.io.records import CONVERGED, DAMAGED, DOUBTFUL, ReasonNames, StatusNames
 
 
-def summarise(records: NDArray[Any], names: StatusNames, error: BaseException | None) -> dict[str, object]:
+def summarise(
+    records: NDArray[Any], names: StatusNames, reasons: ReasonNames, error: BaseException | None
+) -> dict[str, object]:
     """What (F,) records of R templates say; ``error`` is what ended the run before its time, if anything did."""
     templates, damaged = records["score"].shape[1], [code for code, word in names.items() if word == DAMAGED]
     return {
@@ -26,7 +28,9 @@ def summarise(records: NDArray[Any], names: StatusNames, error: BaseException | 
         "frames": len(records),
         "damaged_frames": int(np.isin(records["status"][:, 0], damaged).sum()),
         "templates": templates,
-        "per_template": [_summarise_template(records, names, index) for index in range(templates)],
+        "rows": records["score"].size,
+        "reasons": _counted(records["reason"], reasons),
+        "per_template": [_summarise_template(records, names, reasons, index) for index in range(templates)],
         "versions": _versions(),
     }
 
@@ -37,18 +41,28 @@ def write_json(path: Path, summary: dict[str, object]) -> None:
         append(file, (json.dumps(plain(summary), indent=2, allow_nan=False) + "\n").encode())
 
 
-def _summarise_template(records: NDArray[Any], names: StatusNames, index: int) -> dict[str, object]:
+def _counted(values: NDArray[np.int8], names: StatusNames | ReasonNames) -> dict[str, int]:
+    """How many of the codes each word stands for, without those that have none."""
+    codes, counts = np.unique(values, return_counts=True)
+    return {names[code]: count for code, count in zip(codes.tolist(), counts.tolist(), strict=True) if names[code]}
+
+
+def _summarise_template(
+    records: NDArray[Any], names: StatusNames, reasons: ReasonNames, index: int
+) -> dict[str, object]:
     status = np.asarray(records["status"][:, index])
-    codes, counts = np.unique(status, return_counts=True)
-    found = [code for code, word in names.items() if word in (CONVERGED, DOUBTFUL)]
-    lost = np.flatnonzero(~np.isin(status, found))
+    found = np.isin(status, [code for code, word in names.items() if word in (CONVERGED, DOUBTFUL)])
+    lost, coverage = np.flatnonzero(~found), np.asarray(records["coverage"][:, index])[found]
     variance = (records["covariance"][:, index, axis, axis] for axis in range(3))
     return {
-        "status": {names[int(code)]: int(count) for code, count in zip(codes, counts, strict=True)},
+        "status": _counted(status, names),
+        "reasons": _counted(records["reason"][:, index], reasons),
         "lost_frames": len(lost),
         "first_lost_frame": int(lost[0]) if len(lost) else None,
         "last_lost_frame": int(lost[-1]) if len(lost) else None,
         "mean_score": float(np.mean(records["score"][:, index])),
+        "mean_coverage": float(coverage.mean()) if len(coverage) else None,
+        "least_coverage": float(coverage.min()) if len(coverage) else None,
         "median_sigma": {
             name: math.sqrt(np.median(values))
             for name, values in zip(("x_px", "y_px", "theta_rad"), variance, strict=True)

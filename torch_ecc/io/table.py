@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from torch_ecc.io.frames import Frame
 from torch_ecc.io.records import sigma
 
 _XY, _ANGLE, _SHORT = "%.6f", "%.9f", "%.4g"  # 1e-6 px or um and 1e-9 rad are far below what light allows
+
+_OF_POSES, _NOTHING = ("_px", "_rad", "_um"), "%.0s"
 
 
 def _columns(*, timed: bool, named: bool, micrometres: bool) -> dict[str, str]:
@@ -27,23 +30,28 @@ def _columns(*, timed: bool, named: bool, micrometres: bool) -> dict[str, str]:
         | {f"d{name}": number for name, number in pose.items()}
         | ({"dx_um": _XY, "dy_um": _XY} if micrometres else {})
         | {f"sigma_{name}": _SHORT for name in pose}
-        | {"score": "%.6f", "status": "%s", "iterations": "%d", "residual_rms": _SHORT, "coverage": "%.3f"}
-        | {"damage": "%s"}
+        | {"score": "%.6f", "status": "%s", "reason": "%s", "iterations": "%d"}
+        | {"residual_rms": _SHORT, "coverage": "%.3f", "damage": "%s"}
     )
 
 
 class Table:
     """Turns records into the text of the table; ``timed``, ``named`` and ``micrometres`` say which optional columns
-    there are. Every row is one line, whatever a file is called."""
+    there are. Every row is one line, whatever a file is called. Of a template that was lost no number about its pose is
+    there, so that nothing draws one."""
 
     def __init__(self, *, timed: bool, named: bool = False, micrometres: bool = False) -> None:
         columns = _columns(timed=timed, named=named, micrometres=micrometres)
         self.header = ",".join(columns) + "\n"
         self._timed, self._named = timed, named
         self._row = ",".join(columns.values()) + "\n"
+        own = {name: _NOTHING if name.endswith(_OF_POSES) else number for name, number in columns.items()}
+        self._lost = ",".join(own.values()) + "\n"
 
-    def rows(self, frame: Frame, arrays: Mapping[str, NDArray[Any]], status: Sequence[str]) -> str:
-        """The rows of one frame: R templates."""
+    def rows(
+        self, frame: Frame, arrays: Mapping[str, NDArray[Any]], status: Sequence[str], reason: Sequence[str]
+    ) -> str:
+        """The rows of one frame: R templates, those without a pose NaN."""
         time = "" if frame.time_s is None else f"{frame.time_s:.9f}"
         own = [quoted(frame.name)] * self._named + [time] * self._timed
         um = (arrays["displacement_um"],) if "displacement_um" in arrays else ()
@@ -51,8 +59,9 @@ class Table:
         last = (arrays[name].tolist() for name in ("score", "iterations", "residual_rms", "coverage"))
         damage = quoted(frame.damage or "")
         return "".join(
-            self._row % (frame.number, k, *own, *row, score, word, *tail, damage)
-            for k, (row, word, score, *tail) in enumerate(zip(numbers, status, *last, strict=True))
+            (self._lost if isnan(row[0]) else self._row)
+            % (frame.number, k, *own, *row, score, word, why, *tail, damage)
+            for k, (row, word, why, score, *tail) in enumerate(zip(numbers, status, reason, *last, strict=True))
         )
 
 

@@ -22,18 +22,22 @@ from torch import Tensor
 from torch_ecc.io.frames import Frame
 from torch_ecc.io.journal import Form, Journal, Unfinished
 from torch_ecc.io.output import check_folder, create, part, publish
-from torch_ecc.io.records import Record, StatusNames, to_arrays, words
+from torch_ecc.io.records import CONVERGED, DOUBTFUL, ReasonNames, Record, StatusNames, to_arrays, words
 from torch_ecc.io.summary import summarise, write_json
 
 FILES = ("track.csv", "track.npz", "summary.json")
+NO_REASON = {0: ""}
 
 
 class TrackWriter:
     """Context manager: ``write`` each frame's record, and find track.csv, track.npz and summary.json in ``out_dir``.
 
-    ``status_names`` is the word for each status code; ``fps`` in Hz is the time of frames that bring none of their own;
-    ``um_matrix`` (2, 2), which takes a displacement (dx, dy) in px to micrometres, adds the columns dx_um and dy_um;
-    ``settings`` goes into summary.json. ``unfinished``: what a run before has left, to go on with.
+    ``status_names`` is the word for each status code, ``reason_names`` that for each reason; ``fps`` in Hz is the time
+    of frames that bring none of their own; ``um_matrix`` (2, 2), which takes a displacement (dx, dy) in px to
+    micrometres, adds the columns dx_um and dy_um; ``settings`` goes into summary.json. ``unfinished``: what a run
+    before has left, to go on with.
+
+    Where a template was lost its pose and displacement are NaN, empty in the table: an old pose would look like a stop.
 
     A run that ends by an exception keeps the frames that it had: summary.json says ``"complete": false`` and why, and,
     where there is a state, a ``.part`` file stays that a later run can go on with. So do those of a process that is
@@ -46,6 +50,7 @@ class TrackWriter:
         out_dir: str | Path,
         *,
         status_names: StatusNames,
+        reason_names: ReasonNames = NO_REASON,
         fps: float | None = None,
         um_matrix: Tensor | None = None,
         settings: Mapping[str, object] | None = None,
@@ -56,7 +61,8 @@ class TrackWriter:
             raise ValueError(f"TrackWriter: fps must be a positive number, got {fps}")
         if um_matrix is not None and tuple(um_matrix.shape) != (2, 2):
             raise ValueError(f"TrackWriter: um_matrix must be (2, 2), got {tuple(um_matrix.shape)}")
-        self.fps, self.status_names, self.settings = fps, dict(status_names), dict(settings or {})
+        self.status_names, self.reason_names = dict(status_names), dict(reason_names)
+        self.fps, self.settings = fps, dict(settings or {})
         self.um_matrix = None if um_matrix is None else um_matrix.detach().cpu().numpy().astype("f8")
         self._journal = None if unfinished is None else Journal.go_on(self.out_dir, unfinished)
         self._started, self._before = time.perf_counter(), self.frames
@@ -73,13 +79,17 @@ class TrackWriter:
             frame = Frame(self.frames, None, None if self.fps is None else self.frames / self.fps)
         arrays = to_arrays(record)
         status = words(arrays["status"], self.status_names)
+        reason = words(arrays["reason"], self.reason_names, "reason")
+        lost = [word not in (CONVERGED, DOUBTFUL) for word in status]
+        if any(lost):
+            arrays["pose"][lost] = arrays["displacement"][lost] = np.nan
         if self.um_matrix is not None:
             arrays["displacement_um"] = arrays["displacement"][:, :2] @ self.um_matrix.T
         if self._journal is None:
             timed, micrometres = frame.time_s is not None, "displacement_um" in arrays
             form = Form(len(status), timed, bool(frame.name), micrometres, len(state))
             self._journal = Journal.begin(self.out_dir, form, self.settings)
-        self._journal.append(arrays, status, frame, state)
+        self._journal.append(arrays, (status, reason), frame, state)
 
     def __enter__(self) -> Self:
         self._started, self._before = time.perf_counter(), self.frames
@@ -105,7 +115,7 @@ class TrackWriter:
         fields: dict[str, Any] = {name: records[name] for name in journal.fields} | self._constants()
         with BufferedWriter(create(part(self.out_dir, "track.npz"))) as file:
             np.savez(file, **fields)  # copied through a small buffer
-        summary = summarise(records, self.status_names, error)
+        summary = summarise(records, self.status_names, self.reason_names, error)
         rate = (journal.frames - self._before) / seconds
         summary |= {"frames_per_s": rate, "fps": self.fps, "settings": self.settings}
         if self.um_matrix is not None:
@@ -122,5 +132,7 @@ class TrackWriter:
         constants = {
             "status_codes": np.array(list(self.status_names), np.int8),
             "status_names": np.array(list(self.status_names.values())),
+            "reason_codes": np.array(list(self.reason_names), np.int8),
+            "reason_names": np.array(list(self.reason_names.values())),
         }
         return constants if self.um_matrix is None else constants | {"um_matrix": self.um_matrix}

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting
-from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
@@ -74,8 +74,16 @@ def disbelieved(estimate: Estimate, suspects: list[bool], start: Tensor, past: P
     lost = torch.tensor(suspects, device=start.device) & slid & Status.good(estimate.status)
     return estimate._replace(
         status=torch.where(lost, int(Status.LOST), estimate.status).to(torch.int8),
+        reason=torch.where(lost, int(Reason.ELSEWHERE), estimate.reason).to(torch.int8),
         covariance=torch.where(lost[:, None, None], unknown(estimate.covariance), estimate.covariance),
     )
+
+
+def ambiguous(estimate: Estimate, index: Tensor) -> Estimate:
+    """The ``estimate`` that tells of those at ``index`` (n,) that are lost that a look-alike is why."""
+    lost = estimate.status[index] == Status.LOST
+    reason = torch.where(lost, int(Reason.AMBIGUOUS), estimate.reason[index]).to(torch.int8)
+    return estimate._replace(reason=estimate.reason.index_copy(0, index, reason))
 
 
 def familiar(found: Estimate, usual: Tensor) -> Tensor:
@@ -171,7 +179,7 @@ class Recovery:
         distance = pose_distance(best.pose[0], pose, radius=radius)
         others = LookAlikes.around(found, best.pose[0], radius).nearest(best.score[0], torch.ones_like(radius))
         if distance > NEARER * torch.minimum(others, self.twin(r, best.score[0], past, locator)):
-            return estimate
+            return ambiguous(estimate, index)
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
 
@@ -188,7 +196,7 @@ class Recovery:
         twin = torch.stack([self.near[r].nearest(found.score[r], raised[r]) for r in leapt.tolist()])
         distance = pose_distance(found.pose[leapt], start[leapt], radius=self.reference.place.radius[leapt])
         doubtful = leapt[distance > NEARER * twin]
-        return found.put(doubtful, before.at(doubtful))
+        return ambiguous(found.put(doubtful, before.at(doubtful)), doubtful)
 
     def raised(self, score: Tensor, usual: Tensor) -> Tensor:
         """By what factor (R,) scores are higher than they were in the first frame, as far as the ``usual`` one (R,)

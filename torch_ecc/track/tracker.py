@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion
-from torch_ecc.core.estimate import Estimate, Origin, Status, Track
+from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
 from torch_ecc.core.patches import Centers, Crop, Size, crop, locate_patches
 from torch_ecc.core.pose import ahead
@@ -254,9 +254,10 @@ class Tracker(nn.Module):
         state: Any = self._buffers
         state["tracked"].zero_()  # what comes next has made more than one step
         pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
-        status, origin = (none.to(torch.int8) + int(code) for code in (Status.DAMAGED, Origin.TRACKED))
+        codes = (Status.DAMAGED, Origin.TRACKED, Reason.DAMAGED)
+        status, origin, reason = (none.to(torch.int8) + int(code) for code in codes)
         unknown, moved = torch.diag_embed(torch.full_like(pose, torch.inf)), pose - state["start"]
-        return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone())
+        return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone(), reason)
 
     def track_sequence(self, frames: Iterable[Tensor | None], *, stop_at_damage: bool = False) -> Track:
         """Poses in every frame of a sequence: Track (F, R, ...).
