@@ -6,12 +6,16 @@ import copy
 import io
 import pickle
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from engines import BACKENDS
 from torch import Tensor
 
 from torch_ecc import Origin, Status, Tracker
+from torch_ecc.commands.jobs import TrackJob
+from torch_ecc.commands.track import Session
 from torch_ecc.sim.scene.waves import PlaneWaves
 
 SHAPE, SIZE = (150, 160), 81
@@ -192,3 +196,21 @@ def test_what_is_no_mask_is_refused(what):
     mask, words = WRONG[what]
     with pytest.raises(ValueError, match=words):
         tracker(filmed(PATH[:1]), frame_mask=mask)
+
+
+def test_the_command_line_takes_a_picture(tmp_path):
+    """Its brighter half is shown, whatever JPEG or a scan have made of black."""
+    frames, shown = marked(filmed(), SHOWN["stripe"]), SHOWN["stripe"]
+    np.save(tmp_path / "video.npy", frames.numpy())
+    cv2.imwrite(str(tmp_path / "mask.png"), (20 + 200 * shown.numpy()).astype(np.uint8))
+    options = {"centers": (CENTER[0],), "size": SIZE, "out": str(tmp_path / "out"), "overlay": False}
+    session = Session(TrackJob(input=str(tmp_path / "video.npy"), frame_mask=str(tmp_path / "mask.png"), **options))
+    assert torch.equal(session.tracker.frame_mask, shown)
+    session.run()
+    with np.load(tmp_path / "out" / "track.npz") as track:
+        assert np.abs(track["pose"][:, 0] - PATH.numpy()).max() < 0.03
+    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((150, 170), np.uint8))
+    with pytest.raises(ValueError, match=r"frame_mask must be \(150, 160\), as the frame, got \(150, 170\)"):
+        Session(
+            TrackJob(input=str(tmp_path / "video.npy"), frame_mask=str(tmp_path / "mask.png"), force=True, **options)
+        )

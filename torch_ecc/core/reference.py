@@ -113,8 +113,8 @@ class Blocks(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """Where a camera has ``shown`` (H, W) the scene, not a mark of its own; ``clear`` (H, W), where none bears on a block
-    of pixels, ``well_clear`` (H, W), nor a little off; the blocks' ``middles`` (3, blocks). See ``core.sight``."""
+    """Where a camera has ``shown`` (H, W) the scene, not a mark of its own; ``clear`` (H, W), where none bears on a
+    block of pixels, ``well_clear`` (H, W), nor a little off; the blocks' ``middles`` (3, blocks). See ``sight``."""
 
     shown: Tensor
     clear: Tensor
