@@ -13,7 +13,7 @@ import torch
 from engines import BACKENDS
 from torch import Tensor
 
-from torch_ecc import Origin, Status, Tracker
+from torch_ecc import Origin, Status, Tracker, suggest_frame_mask
 from torch_ecc.commands.jobs import TrackJob
 from torch_ecc.commands.track import Session
 from torch_ecc.sim.scene.waves import PlaneWaves
@@ -214,3 +214,59 @@ def test_the_command_line_takes_a_picture(tmp_path):
         Session(
             TrackJob(input=str(tmp_path / "video.npy"), frame_mask=str(tmp_path / "mask.png"), force=True, **options)
         )
+
+
+def swung(count: int = 20, reach: float = 10) -> Tensor:
+    """A path (F, 3) that comes back."""
+    angle = torch.arange(count, dtype=torch.float64) / (count - 1) * 2 * torch.pi
+    return torch.stack((79 + reach * angle.sin(), 75 + reach * (1 - angle.cos()), 0.04 * angle.sin()), 1)
+
+
+@pytest.mark.parametrize("mark", ["stripe", "dust"])
+def test_marks_are_told_from_a_track_that_they_have_bent(mark):
+    """By tracking twice; what is right then is right to what noise makes of it."""
+    path, shown = swung(), SHOWN[mark]
+    frames, mask = marked(filmed(path), shown), None
+    for _ in range(2):
+        track = tracker(frames, frame_mask=mask).track_sequence(frames[1:])
+        mask = suggest_frame_mask(frames[1:], track, SIZE)
+    crossed = (X - 79).abs().maximum((Y - 85).abs()) < 35
+    assert (mask & ~shown & crossed).sum() < 0.1 * (~shown & crossed).sum()
+    assert (~mask & shown).sum() < 0.05 * (~shown).sum()
+    error = (tracker(frames, frame_mask=mask).track_sequence(frames[1:]).pose[:, 0] - path[1:])[:, :2]
+    assert error.abs().max() < 0.05
+
+
+@pytest.mark.parametrize("light", [1.0, 0.6])
+def test_a_camera_without_marks_gets_no_mask(light):
+    """However it moves or does not, and whatever the light does."""
+    for reach in (0, 10):
+        frames = SCENE.render(swung(reach=reach), SHAPE)[:, 0].float()
+        frames = noisy(frames * torch.linspace(1, light, len(frames))[:, None, None])
+        track = tracker(frames).track_sequence(frames[1:])
+        assert suggest_frame_mask(frames[1:], track, SIZE).all()
+
+
+def test_what_covers_the_template_for_some_frames_is_no_mark():
+    """But for the rim, which few frames tell of."""
+    frames = filmed(swung())
+    frames[4:8, :, 60:75] = 12
+    track = tracker(frames).track_sequence(frames[1:])
+    assert (~suggest_frame_mask(frames[1:], track, SIZE)).sum() < 0.01 * SIZE**2
+
+
+def test_frames_that_are_not_the_tracks_are_refused():
+    frames = filmed()
+    track = tracker(frames).track_sequence(frames[1:])
+    for some, words in (
+        (frames, "frames must be 5, as many as the track has, got 6"),
+        (frames[1:4], "frames must be 5, as many as the track has, got 3"),
+        ([*frames[1:5], frames[5, :90]], "frame 4 must be one of the first one's size"),
+        ([[1]], "frame 0 must be a torch tensor"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            suggest_frame_mask(some, track, SIZE)
+    with pytest.raises(ValueError, match=r"track must be \(F, R, ...\)"):
+        suggest_frame_mask(frames, tracker(frames)(frames[1]), SIZE)
+    with pytest.raises(ValueError, match="size must be"):
+        suggest_frame_mask(frames[1:], track, 2)
