@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
     from torch_ecc.core.reference import Reference, prepare
     from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
     from torch_ecc.search.locate import Located, Locator, locate
+    from torch_ecc.track.frame_mask import suggest_frame_mask
     from torch_ecc.track.stabilise import stabilise
     from torch_ecc.track.tracker import SequenceError, Tracker
 
@@ -33,6 +34,7 @@ _PLACES = {
     "core.reference": ["Reference", "prepare"],
     "records.calibration": ["Calibration", "CalibrationFit", "calibrate"],
     "search.locate": ["Located", "Locator", "locate"],
+    "track.frame_mask": ["suggest_frame_mask"],
     "track.stabilise": ["stabilise"],
     "track.tracker": ["SequenceError", "Tracker"],
 }
@@ -60,6 +62,7 @@ __all__ = [
     "pose",
     "prepare",
     "stabilise",
+    "suggest_frame_mask",
     "texture",
 ]
 

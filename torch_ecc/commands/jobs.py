@@ -61,6 +61,11 @@ class TrackJob(Tracking):
     reference: str | None = described(
         None, "image to cut the templates from; without it, the first frame of the input", example="first.png"
     )
+    frame_mask: str | None = described(
+        None,
+        "image of the frame's size, black where the camera shows a mark of its own: dust, aperture",
+        example="mask.png",
+    )
     template: tuple[str, ...] = described(
         (),
         "image of each template, instead of size: found anywhere, at any angle, nearest to its centre if given",

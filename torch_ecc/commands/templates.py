@@ -54,6 +54,15 @@ def read_templates(job: TrackJob) -> Tensor | None:
     return torch.cat(crops)
 
 
+def read_frame_mask(job: TrackJob) -> Tensor | None:
+    """Where the camera shows the scene, (H, W) bool: the brighter half of the grey levels in the image
+    ``job.frame_mask``, None if there is none."""
+    if job.frame_mask is None:
+        return None
+    image = as_gray("frame_mask", job.frame_mask, open_frames(job.frame_mask).first)[0, 0]
+    return image > image.max() / 2
+
+
 def refuse_doubt(located: Located, placed: bool) -> None:
     """ValueError for the first template that the first frame does not show, or shows at several places unless it is
     known which one is meant."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_ecc.commands.jobs import TrackJob, span
-from torch_ecc.commands.templates import Templates, choose_templates, read_templates, refuse_doubt
+from torch_ecc.commands.templates import Templates, choose_templates, read_frame_mask, read_templates, refuse_doubt
 from torch_ecc.core.ambient import threads_for
 from torch_ecc.core.estimate import Reason, Status
 from torch_ecc.io import Frame, OverlayWriter, TrackWriter, open_frames
@@ -75,12 +75,13 @@ class Session:
         centers, size, mask = self.templates
         if job.stabilise is not None and not 0 <= job.stabilise < len(centers):
             raise ValueError(f"stabilise: expected a template from 0 to {len(centers) - 1}, got {job.stabilise}")
+        options = job.options() | {"frame_mask": read_frame_mask(job)}
         with threads_for(len(centers) * size[0] * size[1]):
             if crops is None:
-                self.tracker = Tracker(first, centers, size, mask=mask, **job.options())
+                self.tracker = Tracker(first, centers, size, mask=mask, **options)
             else:
                 near = torch.tensor(job.centers).double() if job.centers else None
-                self.tracker, located = Tracker.find(crops, first, near=near, **job.options())
+                self.tracker, located = Tracker.find(crops, first, near=near, **options)
                 refuse_doubt(located, near is not None)
         self.settings = settings_of(job, first)
 

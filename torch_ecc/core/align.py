@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
-from torch_ecc.core import native, robust, solver
+from torch_ecc.core import native, robust, sight, solver
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
@@ -56,5 +58,6 @@ def solve(
 ) -> Estimate:
     """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype; ``origin``:
     what displacements count from, by default the ``pose``; ``usual`` (B,): the templates' scores so far."""
-    engine = native if native.takes(reference, image, settings) else solver
-    return judge(reference, robust.solve(engine.solve, reference, image, pose, settings, usual), pose, settings, origin)
+    engine = native.solve if native.takes(reference, image, settings) else solver.solve
+    seeing = engine if reference.sight is None else partial(sight.solve, engine)
+    return judge(reference, robust.solve(seeing, reference, image, pose, settings, usual), pose, settings, origin)

@@ -73,7 +73,7 @@ _SENTENCES = {
     Status.CONVERGED: "The pose is good to the requested tolerance.",
     Status.MAX_ITERATIONS: "The pose was still moving by more than the tolerance when the iterations ran out.",
     Status.LOST: "The frame does not look like the template near the expected place; the last good pose is kept.",
-    Status.OUT_OF_VIEW: "Too little of the template lies inside the frame; the last good pose is kept.",
+    Status.OUT_OF_VIEW: "Too little of the template is in sight of the camera; the last good pose is kept.",
     Status.LOW_TEXTURE: "The template has too little texture to fix x, y and theta; choose another patch.",
     Status.DAMAGED: "The frame is damaged, or not like the first one; the last good pose is kept.",
 }

@@ -15,6 +15,7 @@ from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.pose import pose_dtype, turn
 from torch_ecc.core.reference import MARGIN, SMALLEST, Reference, prepare
 from torch_ecc.core.sampling import pad
+from torch_ecc.core.sight import eroded
 from torch_ecc.core.verdict import LARGEST_SIGMA, largest_variance, noise_share, pose_covariance
 
 QUANTISATION = 1 / 12  # variance of rounding to whole grey levels
@@ -66,6 +67,21 @@ def locate_patches(where: str, frame: Tensor, centers: Centers, size: Size, mask
         else as_mask(where, mask, len(place), (h, w))
     )
     return Patches(place, corner, (h, w), kept.to(frame.device))
+
+
+def unmarked(where: str, patches: Patches, shown: Tensor | None) -> Patches:
+    """The ``patches`` without what lies under, or too near, a mark in a frame that shows the scene where ``shown``
+    (H, W), by default everywhere. ValueError if nothing of one is left."""
+    if shown is None:
+        return patches
+    (h, w), corner = patches.size, patches.corner
+    x = corner[:, :1] + torch.arange(w, device=shown.device)
+    y = corner[:, 1:] + torch.arange(h, device=shown.device)
+    mask = patches.mask * eroded(shown)[y[:, :, None], x[:, None, :]][:, None]
+    empty = (mask.amax((1, 2, 3)) == 0).nonzero().flatten().tolist()
+    if empty:
+        raise ValueError(f"{where}: frame_mask must show at least one pixel of each template, got none for {empty}")
+    return patches._replace(mask=mask)
 
 
 def as_size(where: str, size: Size) -> tuple[int, int]:

@@ -112,6 +112,16 @@ class Blocks(NamedTuple):
     enough: Tensor
 
 
+class Sight(NamedTuple):
+    """Where a camera has ``shown`` (H, W) the scene, not a mark of its own; ``clear`` (H, W), where none bears on a
+    block of pixels, ``well_clear`` (H, W), nor a little off; the blocks' ``middles`` (3, blocks). See ``sight``."""
+
+    shown: Tensor
+    clear: Tensor
+    well_clear: Tensor
+    middles: Tensor
+
+
 class _Groups(NamedTuple):
     criterion: Criterion
     grid: Grid
@@ -121,13 +131,14 @@ class _Groups(NamedTuple):
     normal: Normal
     noise: Noise
     coarse: Reference | None
+    sight: Sight | None = None
 
 
 class Reference(_Groups):
     """B prepared templates of N pixels under a criterion of p columns: ``K`` (B, p, N), and what else is constant.
 
     ``coarse``: the same templates on a coarser grid, with a K of their own, for the first iterations; None where all
-    pixels are few enough.
+    pixels are few enough. ``sight``: None where the camera has no marks.
     """
 
     @property
@@ -176,7 +187,7 @@ class Reference(_Groups):
 
 
 def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared: bool = False) -> Fields:
-    """``function`` of the tensors at the same place in nested records; of what all templates share, a Grid, only if
+    """``function`` of the tensors at the same place in nested records; of what all share, a Grid or Sight, only if
     ``shared``: else it is that of the first, as is whatever is no tensor."""
     values: list[object] = []
     for value, *more in zip(first, *others, strict=True):
@@ -184,7 +195,7 @@ def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared
             values.append(function(value, *more))
         elif isinstance(value, dict):
             values.append({name: function(v, *(m[name] for m in more)) for name, v in value.items()})
-        elif isinstance(value, tuple) and hasattr(value, "_fields") and (shared or not isinstance(value, Grid)):
+        elif isinstance(value, tuple) and hasattr(value, "_fields") and (shared or not isinstance(value, Grid | Sight)):
             values.append(each(function, value, *more, shared=shared))
         else:
             values.append(value)

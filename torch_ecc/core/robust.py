@@ -8,7 +8,6 @@ where the engine comes to with that trust, until it settles.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import inf
 from typing import NamedTuple
 
@@ -19,10 +18,8 @@ from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.reference import BLOCK, Blocks, Reference, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solution import Solution, Trust
+from torch_ecc.core.solution import Engine, Solution, Trust
 from torch_ecc.core.verdict import LEAST_COVERAGE, correlation, detrended, expected_score, within_margin
-
-Engine = Callable[[Reference, Tensor, Tensor, Settings, Trust | None], Solution]  # ``solver.solve``, ``native.solve``
 
 OUTLIER = 3.0  # times the variance that is expected of a block: beyond it less and less is believed
 DISTRUST = 3.0  # trust = (OUTLIER / ratio)^this

@@ -32,7 +32,7 @@ class Settings:
     max_iterations: int = described(15, "iterations per frame at most")
     tolerance: float = described(1e-3, "remaining error at the template's farthest pixel, px")
     min_score: float = described(0.5, "below this correlation a template is lost")
-    min_visible: float = described(0.25, "with less of its weight in the frame a template is out of view")
+    min_visible: float = described(0.25, "with less of its weight in sight a template is out of view")
     robust: bool = described(True, "blocks that do not fit, as of what covers a part of the template, count less")
     backend: str = described(
         "auto", "on a CPU; auto is native where that is compiled or can be", ("auto", "torch", "native")

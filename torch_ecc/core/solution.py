@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch_ecc.core.criteria import centred
 from torch_ecc.core.normal import Normal
 from torch_ecc.core.reference import Reference
+from torch_ecc.core.settings import Settings
 
 FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 
@@ -36,6 +38,9 @@ class Solution(NamedTuple):
     total: Tensor
     normal: Normal
     trust: Tensor | None = None
+
+
+Engine = Callable[[Reference, Tensor, Tensor, Settings, Trust | None], Solution]  # ``solver.solve``, ``native.solve``
 
 
 def summed(

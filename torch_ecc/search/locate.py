@@ -25,6 +25,7 @@ from torch_ecc.core.pyramid import pyramid
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import Sampler, downsample, inside
 from torch_ecc.core.settings import Settings
+from torch_ecc.core.sight import filled, picked
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import within_margin
 from torch_ecc.search.bank import Bank, search_level
@@ -132,7 +133,8 @@ class Locator:
             raise ValueError(f"locate: image must be on the reference's device {device}, got {gray.device}")
         if near is not None and (near.dim() != 2 or len(near) != count or near.shape[1] not in (2, 3)):
             raise ValueError(f"locate: near must be ({count}, 2) or ({count}, 3), got {tuple(near.shape)}")
-        images = image_pyramid(gray, self.levels)
+        sight = self.pyramids[0][0].sight
+        images = image_pyramid(gray if sight is None else filled(gray, sight.shown), self.levels)
         places = [None] * count if near is None else list(near.to(self.pyramids[0][0].place.radius))
         return _best_two([self.candidates(images, b, places[b], matched_filter=True) for b in range(count)])
 
@@ -213,6 +215,7 @@ def detrended_zncc_at(reference: Reference, image: Tensor, pose: Tensor) -> Tens
     """Detrended ZNCC (K,), off the plane of light, at poses (K, 3); -1 where too little of the template is visible."""
     warp, pixels = reference.warps(pose), reference.grid.pixels
     weight = reference.weight * inside(warp, pixels, (image.shape[-2], image.shape[-1]))
+    weight = weight if reference.sight is None else weight * picked(reference.sight.clear, warp, pixels)
     score = detrended_zncc(reference, weight, Sampler.of(image)(warp, pixels))
     visible = weight.sum(-1) >= LEAST_VISIBLE * reference.weight.sum(-1)
     return torch.where(visible & pose.isfinite().all(-1), score, -1.0)

@@ -19,6 +19,7 @@ from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
+from torch_ecc.core.sight import filled
 from torch_ecc.core.verdict import expected_score, noise_share, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
@@ -128,7 +129,7 @@ class Recovery:
         due = self.due(estimate, past)
         if not due:
             return estimate
-        images[0] = images[0].float()
+        images[:] = self.unmarked(images)
         found = self.search_near(images[0], estimate, start, past.usual, sorted(due))
         estimate = self.follow(images[0], self.own(found, estimate, start, past), start, past.usual)
         suspects = suspect(estimate, past.usual)
@@ -137,6 +138,11 @@ class Recovery:
         for r in gone:
             estimate = self.search_anywhere(images, estimate, past, r)
         return self.follow(images[0], estimate, start, past.usual) if gone else estimate
+
+    def unmarked(self, images: list[Tensor]) -> list[Tensor]:
+        """The ``images`` in float; if the camera has marks, the first one alone, without them."""
+        sight, image = self.reference.sight, images[0].float()
+        return [image, *images[1:]] if sight is None else [filled(image, sight.shown)]
 
     def due(self, estimate: Estimate, past: Past) -> list[int]:
         """Which of the suspect templates to search for in this frame: less often those that have a place or too little

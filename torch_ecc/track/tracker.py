@@ -15,11 +15,12 @@ from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
-from torch_ecc.core.patches import Centers, Crop, Size, crop, locate_patches
+from torch_ecc.core.patches import Centers, Crop, Size, crop, locate_patches, unmarked
 from torch_ecc.core.pose import ahead
 from torch_ecc.core.pyramid import SMALLEST_COARSE, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
+from torch_ecc.core.sight import as_frame_mask, filled, seen_through
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
@@ -46,8 +47,10 @@ class Tracker(nn.Module):
     (criteria.Criterion); ``illumination`` of "ecc": "gain" (the paper's), "linear", "quadratic"; ``interpolation``:
     "bilinear", "bspline3", "bspline5"; ``tolerance``: px at the template's corner; ``levels``: pyramid levels;
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
-    (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``device``: where everything lives (default:
-    the frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in the frame
+    (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``frame_mask``: (H, W), True or > 0 where the
+    camera shows the scene, and not a mark of its own (aperture, stripe, dust): what of a template is there, or within
+    some 3 to 6 px, is out of sight, as beyond the frame's border; ``device``: where everything lives (default:
+    the frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in sight
     it is out of view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
     (``core.robust``); ``search``: look for a template that is lost, or looks less like itself than usual, near where it
     is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
@@ -88,6 +91,7 @@ class Tracker(nn.Module):
         levels: int = 1,
         prediction: str = "velocity",
         mask: Tensor | None = None,
+        frame_mask: Tensor | None = None,
         device: torch.device | str | None = None,
         min_score: float = 0.5,
         min_visible: float = 0.25,
@@ -96,20 +100,19 @@ class Tracker(nn.Module):
         backend: str = "auto",
     ) -> None:
         super().__init__()
-        if prediction not in PREDICTIONS:
-            raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
+        _check_prediction(prediction)
         self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, robust, backend)
-        self.prediction, self.search = prediction, search
-        self.criterion = make_criterion(criterion, illumination)
+        self.prediction, self.search, self.criterion = prediction, search, make_criterion(criterion, illumination)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape, self.levels = tuple(gray.shape), levels
-        patches = locate_patches("Tracker", gray, centers, size, mask)
+        self.frame_mask = _frame_mask("Tracker", frame_mask, gray)
+        patches = unmarked("Tracker", locate_patches("Tracker", gray, centers, size, mask), self.frame_mask)
         _check_levels(levels, patches.size)
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
         none = torch.zeros_like(start[:, 0], dtype=torch.int64)
         for name, value in templates._asdict().items():
             self.register_buffer(name, value)
-        self.register_buffer("first", _kept(gray))  # frame: what else in it looks like them?
+        self.register_buffer("first", _kept(filled(gray, self.frame_mask)))  # frame: what else in it looks like them?
         self.register_buffer("start", start)  # of every template, all (R, 3), px, px, rad
         self.register_buffer("pose", start.clone())  # the last good one
         self.register_buffer("velocity", torch.zeros_like(start))  # what the last step has added to it
@@ -131,14 +134,17 @@ class Tracker(nn.Module):
         Of places that look alike the one nearest to ``near`` (R, 2 or 3) is taken. ``options``: the constructor's.
         theta counts from the template's own image; ``displacement`` from where it was found.
         """
+        frame_mask = options.pop("frame_mask", None)
         gray = as_gray("find", "template", template, as_device("find", options.get("device")))
         h, w = gray.shape[-2:]
         tracker = cls(gray, [((w - 1) / 2, (h - 1) / 2)] * len(gray), (h, w), **options)
         view = as_gray("find", "frame", frame, tracker.pose.device)
+        tracker.frame_mask = _frame_mask("find", frame_mask, view)
+        tracker._use(tracker.references)
         settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
         tracker.frame_shape = tuple(view.shape)
-        tracker.register_buffer("first", _kept(view))
+        tracker.register_buffer("first", _kept(filled(view, tracker.frame_mask)))
         tracker.start.copy_(located.pose)
         tracker.pose.copy_(located.pose)
         return tracker, located
@@ -151,9 +157,9 @@ class Tracker(nn.Module):
         return references
 
     def _use(self, references: list[Reference]) -> None:
-        """Goes on with ``references``."""
-        self.references = references
-        self._recovery = Recovery(references[0], self.settings, self.turn)
+        """Goes on with ``references``, in what the camera shows."""
+        self.references = [seen_through(references[0], self.frame_mask), *references[1:]]
+        self._recovery = Recovery(self.references[0], self.settings, self.turn)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """What is assigned to a part of the state, ``tracker.pose = pose``, is written into it."""
@@ -170,6 +176,7 @@ class Tracker(nn.Module):
         # Only the device may change: poses stay float64 and pixels float32 whatever the rest of a model is cast to.
         device = fn(self.score).device
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
+        self.frame_mask = None if self.frame_mask is None else self.frame_mask.to(device)
         self._use([reference.map(lambda tensor: tensor.to(device)) for reference in self.references])
         return self
 
@@ -286,7 +293,8 @@ class Tracker(nn.Module):
         """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are. What a level has found
         is kept only if it looks better to the next finer one than its start: fine texture is not there in a coarse
         level, which then leads anywhere."""
-        images[:] = image_pyramid(images[0].float(), self.levels) if self.levels > 1 else images
+        if self.levels > 1:
+            images[:] = image_pyramid(filled(images[0].float(), self.frame_mask), self.levels)
         most = self.settings.max_iterations
         for level in range(self.levels - 1, 0, -1):
             scale, double = (pose.new_tensor((s, s, 1.0)) for s in (2.0**level, 2.0))
@@ -333,6 +341,11 @@ def _kept(frame: Tensor) -> Tensor:
     return (gray / gray.square().mean((2, 3), keepdim=True).sqrt().clamp(min=1e-30)).clamp(-1e4, 1e4).half()
 
 
+def _frame_mask(where: str, mask: Tensor | None, frame: Tensor) -> Tensor | None:
+    """Where a camera whose ``frame`` (1 or R, 1, H, W) that is shows the scene, None for everywhere."""
+    return None if mask is None else as_frame_mask(where, mask, (frame.shape[2], frame.shape[3])).to(frame.device)
+
+
 def _warn_of_textureless(each: list[bool]) -> None:
     which = [r for r, textureless in enumerate(each) if textureless]
     if which:
@@ -344,6 +357,11 @@ def _named(criterion: Criterion) -> str:
     """What tells a criterion, in another process too: its own words if it has some, or its class."""
     kind = type(criterion)
     return f"{kind.__module__}.{kind.__qualname__}" if kind.__repr__ is object.__repr__ else repr(criterion)
+
+
+def _check_prediction(prediction: str) -> None:
+    if prediction not in PREDICTIONS:
+        raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
 
 
 def _check_levels(levels: int, size: tuple[int, int]) -> None:
