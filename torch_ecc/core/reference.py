@@ -361,15 +361,6 @@ def _solved(criterion: Criterion, grid: Grid, place: Place, columns: Columns, no
     return Reference(criterion, grid, place, columns, K, normal, noise, None)
 
 
-def counted_pixels(reference: Reference, visible: Tensor | None, trusted: Tensor | None) -> Tensor | None:
-    """By how much the pixels (B, N) count: if they are ``visible`` (B, N), as their blocks are ``trusted``; None where
-    all do."""
-    if trusted is None:
-        return visible
-    share = trusted.to(reference.weight.dtype)[:, reference.grid.block]
-    return share if visible is None else share * visible
-
-
 def reweigh(reference: Reference, counted: Tensor) -> Reference:
     """The reference whose pixels count as ``counted`` (B, N), 0 to 1 or bool: new weight, K and normal equations."""
     columns = reference.columns._replace(weight=reference.columns.weight * counted)

@@ -69,3 +69,12 @@ def summed(
     counted = sums if trusted is None else torch.cat((sums[:, :7] * trusted[:, None], sums[:, 7:]), 1)
     total = torch.cat((counted.sum(-1, dtype=dtype), sums[:, 7:].to(dtype).square().sum(-1)), 1)
     return gain.to(dtype).nan_to_num_(0.0, 0.0, 0.0), sums, total.nan_to_num_(0.0, 0.0, 0.0)
+
+
+def counted_pixels(reference: Reference, visible: Tensor | None, trusted: Tensor | None) -> Tensor | None:
+    """By how much the pixels (B, N) count: if they are ``visible`` (B, N), as their blocks are ``trusted``; None where
+    all do."""
+    if trusted is None:
+        return visible
+    share = trusted.to(reference.weight.dtype)[:, reference.grid.block]
+    return share if visible is None else share * visible

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.pose import retract
-from torch_ecc.core.reference import Reference, counted_pixels, each, restrict, reweigh
+from torch_ecc.core.reference import Reference, each, restrict, reweigh
 from torch_ecc.core.sampling import Sampler, inside, is_cpu, make_sampler
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solution import Solution, Trust, summed
+from torch_ecc.core.solution import Solution, Trust, counted_pixels, summed
 
 COARSE_TOLERANCE = 0.02  # px; the bilinear iterations only have to come near: their own bias is some 0.005 px
 SECANT_RANGE = 1.0  # px; steps beyond it are not accelerated
