@@ -163,3 +163,14 @@ def test_a_quantile_and_a_median_no_cover_can_raise():
     torch.testing.assert_close(
         weighted_median(values[:, :99], weight[:, :99] * 0 + 1), values[:, :99].median(1, True).values
     )
+
+
+def test_where_all_that_tells_the_pose_is_covered_the_flat_rest_is_not_enough():
+    """A mark on flat ground with a faint pattern, and a sheet of that ground over the mark."""
+    y, x = torch.meshgrid(torch.arange(FRAME[0]), torch.arange(FRAME[1]), indexing="ij")
+    ground = 100 + 3 * torch.sin(x / 5) * torch.sin(y / 6)
+    near = ((x - MIDDLE[0]).abs() < 22) & ((y - MIDDLE[1]).abs() < 22)
+    mark = torch.where(near, 60 * torch.sin(x / 2.5) * torch.cos(y / 3.1), 0.0)
+    stack = noisy(torch.stack((ground + mark, ground, ground)), 1.0)
+    track = Tracker(stack[0], [MIDDLE], SIZE, search=False).track_sequence(stack[1:])
+    assert (track.status == Status.LOST).all()
