@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from engines import BACKENDS
+from engines import BACKENDS, compiled
 from torch import Tensor
 
 from torch_ecc import Status, Tracker, align, prepare
@@ -57,10 +57,12 @@ def errors(frames: Tensor, poses: Tensor, **options: object) -> tuple[Tensor, ob
     return (track.pose[:, 0] - poses[1:]) * torch.tensor([1, 1, SIZE / 2**0.5]), track
 
 
-@backends
 @scenes
 @pytest.mark.parametrize("what", ["dark", "mean", "texture"])
-@pytest.mark.parametrize("share", [0.05, 0.15, 0.3])
+@pytest.mark.parametrize(
+    ("share", "backend"),
+    [pytest.param(share, "native", marks=compiled) for share in (0.05, 0.15, 0.3)] + [(0.15, "torch")],
+)
 def test_what_covers_a_part_bends_no_pose(scene, what, share, backend):
     """Right to what noise makes of the rest, and what is told of it is near the truth."""
     frames, poses = shots(scene)

@@ -30,7 +30,7 @@ FIRST_SLIP = 1.0  # to 0.3 px; before the solve by more
 LARGEST_SLIP = 0.5  # where all do, as of blur, nothing need cover any of them
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
-ROUNDS = 8
+ROUNDS, FEW_ROUNDS = 8, 3  # until trust settles; where the host does not look
 CLEARLY_LESS = 0.9  # of the cost of least squares: where all edges fit worse, as by blur, leaving them out gains little
 FITS = 1.4  # median excess: nothing else is tried
 BRIGHTER = 2.0  # times the gain of least squares
@@ -134,7 +134,8 @@ def solved_again(doubted: Doubted, start: Tensor, plain: Solution, familiar: Ten
     best, (least, fits) = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain, plain.gain)
     brightest = BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
     least = CLEARLY_LESS * least
-    for place, begin in ((there, first), (start, None), (there, None)):
+    trials: list[tuple[Tensor, tuple[Scale, Tensor] | None]] = [(there, first), (start, None), (there, None)]
+    for place, begin in trials if is_cpu(start.device) else trials[:1]:  # elsewhere all templates would go through all
         found = reweighted(doubted, place, begin or median_look(doubted, place))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
         near = torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < BASIN
@@ -169,7 +170,7 @@ def reweighted(doubted: Doubted, place: Tensor, first: tuple[Scale, Tensor]) -> 
     """Solved from their ``place`` (B, 3) on, with trust that begins with the ``first`` scale and excess and settles."""
     blocks, (scale, ratio) = doubted.blocks, first
     after = trust(ratio)
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if is_cpu(place.device) else FEW_ROUNDS):
         before = after
         found = doubted.solve(place, doubted.settings, before)
         most = Scale(scale.noise, scale.slip.clamp(max=SLIP))  # no cover may talk itself in
