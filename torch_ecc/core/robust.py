@@ -16,11 +16,12 @@ from torch import Tensor
 
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.reference import BLOCK, Blocks, Reference, each
-from torch_ecc.core.sampling import is_cpu
+from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust
 from torch_ecc.core.verdict import LEAST_COVERAGE, correlation, detrended, expected_score, within_margin
 
+ROUNDED_OFF = 0.15  # of the contrast, by bilinear interpolation
 OUTLIER = 3.0  # times the variance that is expected of a block: beyond it less and less is believed
 DISTRUST = 3.0  # trust = (OUTLIER / ratio)^this
 NO_TRUST = 0.02  # less is none
@@ -63,7 +64,9 @@ class Doubted(NamedTuple):
     def of(engine: Engine, reference: Reference, image: Tensor, settings: Settings, usual: Tensor) -> Doubted:
         """All of them."""
         which = torch.arange(len(usual), device=usual.device)
-        return Doubted(engine, reference, image, settings, which, reference.blocks, least_noise(reference), usual)
+        return Doubted(
+            engine, reference, image, settings, which, reference.blocks, least_noise(reference, settings), usual
+        )
 
     def at(self, part: Tensor) -> Doubted:
         """Some of them."""
@@ -84,6 +87,8 @@ def solve(
         return found
     usual, on_cpu = expected_score(reference) if usual is None else usual, is_cpu(start.device)
     odd = unusual(reference, found, usual)
+    if on_cpu and odd.any():
+        odd &= ~((residual_variance(found.sums) <= OUTLIER * least_noise(reference, settings)).all(1))
     if on_cpu and not odd.any():
         return found
     doubted, plain = Doubted.of(engine, reference, image, settings, usual), found
@@ -225,10 +230,12 @@ def excess(variance: Tensor, blocks: Blocks, seen: Tensor, scale: Scale) -> Tens
     return (ratio - 1).mul_((seen / BLOCK**2).clamp_(max=1).sqrt_()).add_(1)
 
 
-def least_noise(reference: Reference) -> Tensor:
-    """Variance (B, 1) that noise has at least: that of the template's, or next to nothing of its contrast."""
+def least_noise(reference: Reference, settings: Settings) -> Tensor:
+    """Variance (B, 1) that noise has at least: that of the template's, or next to nothing of its contrast; of a sampler
+    without prefilter, what it rounds off itself."""
     contrast = reference.normal.energy / reference.normal.total.clamp(min=LEAST)
-    least = torch.maximum(reference.noise.power, LEAST_NOISE**2 * contrast)
+    share = LEAST_NOISE if SAMPLERS[settings.interpolation].ring else ROUNDED_OFF
+    least = torch.maximum(reference.noise.power, share**2 * contrast)
     return least.to(reference.K.dtype).unsqueeze(1)
 
 
