@@ -116,3 +116,11 @@ def test_files_and_functions_stay_small(path):
 def test_the_public_names_exist():
     for name in torch_ecc.__all__:
         assert getattr(torch_ecc, name).__doc__, name
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if parts(p)[0] == "core"], ids=lambda p: p.name)
+def test_the_core_is_plain_torch(path):
+    """Without numpy, and without types that say nothing."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        assert not {"numpy", "Any"} & set(names), path.name

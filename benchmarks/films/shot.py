@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -57,7 +58,7 @@ class Film(NamedTuple):
     seen: Tensor
     bound: Tensor
     clear: int
-    options: dict[str, Any] = {}  # noqa: RUF012 - never written to
+    options: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ class Shot:
 
     scene: Scene
     seed: int = 0
-    path: Tensor = eq11(frames())  # noqa: RUF009 - never written to
+    path: Tensor = field(default_factory=lambda: eq11(frames()))
     size: int = SIZE
     frame: tuple[int, int] = FRAME
 

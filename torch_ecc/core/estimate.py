@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import plain
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 class Status(IntEnum):
@@ -179,7 +182,7 @@ class Estimate(NamedTuple):
         moved = calibration.to_physical(self.displacement)
         return Physical(torch.where(self.ok[..., None], moved, torch.nan), calibration.covariance(self.covariance))
 
-    def to_pandas(self) -> Any:
+    def to_pandas(self) -> DataFrame:
         """A pandas.DataFrame of one row per template (and frame): the columns of track.csv and the other fields.
 
         ModuleNotFoundError, in words, where there is no pandas.

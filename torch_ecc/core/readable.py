@@ -6,12 +6,15 @@ import math
 from collections.abc import Sequence
 from enum import IntEnum
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 ROWS = 20  # templates that are listed; of more the first and last half of that
 WORDS: dict[str, type[IntEnum]] = {"status": Status, "origin": Origin, "reason": Reason}
@@ -53,7 +56,7 @@ def track_text(track: Track) -> str:
     return f"{words}\n{aligned(head, rows, count)}"
 
 
-def to_frame(estimate: Estimate) -> Any:
+def to_frame(estimate: Estimate) -> DataFrame:
     """A pandas.DataFrame of one row per template (and frame), by the columns of track.csv and every other field. As
     there, nothing that draws it takes an old pose for one: it is NaN.
 
@@ -66,7 +69,7 @@ def to_frame(estimate: Estimate) -> Any:
     e = on_host(estimate)
     shape = e.status.shape
     index = torch.meshgrid(*(torch.arange(n) for n in shape), indexing="ij")
-    columns: dict[str, Any] = dict(zip(("frame", "template")[-len(shape) :], (i.flatten() for i in index), strict=True))
+    columns = dict(zip(("frame", "template")[-len(shape) :], (i.flatten() for i in index), strict=True))
     for prefix, values in (("", e.pose), ("d", e.displacement), ("sigma_", e.sigma)):
         new = torch.where(e.ok[..., None], values, math.nan)
         columns |= {f"{prefix}{name}": new[..., k].flatten() for k, name in enumerate(POSE)}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from math import inf
-from typing import Any
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -32,6 +32,8 @@ DOUBTFUL_SHARE = 0.8  # of the noise that there may be, as the likely reason why
 LEAST_CONTRAST = 0.1  # of the template's: what has less is flat, and so is what has no more than
 BARE_NOISE = 2.0  # times the template's noise
 PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light is rounding
+
+Number = TypeVar("Number", float, Tensor)
 
 # The tests of ``decide`` in their order, and what the first one that fails tells.
 VERDICTS = (
@@ -149,10 +151,15 @@ def expected_score(reference: Reference) -> Tensor:
     return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
 
 
-def within_margin(score: Any, best: Any) -> Any:
-    """Whether a ``score`` s is as good as the ``best`` one, 1 - s <= a (1 - s_best) + b, any shape: bool."""
+def shortfall(score: Number, best: Number) -> Number:
+    """By how much a ``score`` s is worse than one as good as the ``best``: (1 - s) - a (1 - s_best) - b, any shape."""
     a, b = AMBIGUITY_MARGIN
-    return 1 - score <= a * (1 - best) + b
+    return 1 - score - a * (1 - best) - b
+
+
+def within_margin(score: Tensor, best: Tensor) -> Tensor:
+    """Whether a ``score`` is as good as the ``best`` one, any shape: bool."""
+    return shortfall(score, best) <= 0
 
 
 def correlation(normal: Normal, total: Tensor) -> Tensor:

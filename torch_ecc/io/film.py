@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,3 +58,19 @@ class Film:
         if self._sink is None and self._kept:
             self._sink = open_sink(self.folder, self.name, self._fps, self._kept, as_frames=self._as_frames)
         return self._sink.close(keep=self.resumable and not whole) if self._sink else None
+
+
+class FilmWriter:
+    """Context manager of what makes a ``film``. Afterwards ``path`` is where it is, None if no frame came."""
+
+    def __init__(self, film: Film) -> None:
+        self.film = film
+        self.path: Path | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.path = self.film.close(whole=error is None)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from torch_ecc.core.pose import matrix
 from torch_ecc.io.canvas import WHITE, Box, Canvas, Stretch
-from torch_ecc.io.film import Film, Picture
+from torch_ecc.io.film import Film, FilmWriter, Picture
 from torch_ecc.io.frames import Frame
 from torch_ecc.io.marks import Labels, Mark, draw
 from torch_ecc.io.records import Record, StatusNames, to_arrays, words
@@ -24,7 +23,7 @@ from torch_ecc.io.shapes import Shape, outlines
 _TRAIL_FRAMES = 60
 
 
-class OverlayWriter:
+class OverlayWriter(FilmWriter):
     """Context manager: ``write`` each frame with its record, and find overlay.mp4 in ``out_dir``.
 
     ``shapes`` is what each of the R templates covers: its (h, w), or its mask (h, w). Green is converged, orange
@@ -47,8 +46,7 @@ class OverlayWriter:
         um_matrix: Tensor | None = None,
         as_frames: bool = False,
     ) -> None:
-        self.film = Film(out_dir, "overlay", fps, as_frames=as_frames)
-        self.path: Path | None = None
+        super().__init__(Film(out_dir, "overlay", fps, as_frames=as_frames))
         self._status_names, self._fps = dict(status_names), fps
         self._um = None if um_matrix is None else um_matrix.detach().cpu().numpy()
         self._outlines = [[line.numpy() for line in outlines(shape)] for shape in shapes]
@@ -81,14 +79,6 @@ class OverlayWriter:
         for trail, pose, seen in zip(self._trails, poses.swapaxes(0, 1), found.T, strict=True):
             trail.extend(pose[seen][-_TRAIL_FRAMES:, :2])
         self._frames = len(poses)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.path = self.film.close(whole=error is None)
 
     def _fitting(self, frame: Frame) -> torch.Size | None:
         """The shape of all frames, as far as it is known. ValueError for one that is not like this."""

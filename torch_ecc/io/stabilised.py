@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
@@ -14,12 +12,12 @@ from torch import Tensor
 
 from torch_ecc.core.pose import compose, inverse, matrix
 from torch_ecc.io.canvas import Stretch
-from torch_ecc.io.film import Film, Picture
+from torch_ecc.io.film import Film, FilmWriter, Picture
 from torch_ecc.io.frames import Frame
 from torch_ecc.io.records import Record
 
 
-class StabilisedWriter:
+class StabilisedWriter(FilmWriter):
     """Context manager: ``write`` each frame with its record, and find stabilised.mp4 in ``out_dir``, in which
     ``template`` stays where and as it was at the start. 8 bits, cubic interpolation; ``fps`` as of ``OverlayWriter``.
 
@@ -27,8 +25,7 @@ class StabilisedWriter:
     """
 
     def __init__(self, out_dir: str | Path, template: int, *, fps: float | None = None) -> None:
-        self.film = Film(out_dir, "stabilised", fps)
-        self.path: Path | None = None
+        super().__init__(Film(out_dir, "stabilised", fps))
         self._template = template
         self._stretch: Stretch | None = None
         self._last: Picture | None = None
@@ -41,14 +38,6 @@ class StabilisedWriter:
     def go_on(self, poses: NDArray[np.float64], found: NDArray[np.bool_]) -> None:
         """After the pictures of the first F frames of an unfinished run, with ``poses`` (F, R, 3)."""
         self.film.go_on(len(poses))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.path = self.film.close(whole=error is None)
 
     def _warped(self, frame: Frame, motion: Tensor) -> Picture:
         if frame.pixels is not None:
