@@ -35,8 +35,8 @@ ROUNDS, FEW_ROUNDS = 8, 3  # until trust settles; where the host does not look
 CLEARLY_LESS = 0.9  # of the cost of least squares: where all edges fit worse, as by blur, leaving them out gains little
 FITS = 1.4  # median excess: nothing else is tried
 BRIGHTER = 2.0  # times the gain of least squares
-FAMILIAR = 0.9  # of the usual score: least squares that reaches it has found the template
-BASIN = 8.0  # px at the farthest pixel: what is seen in part is not farther from the start
+RECOGNISED = 0.9  # of the usual score: least squares that reaches it has found the template
+FARTHEST = 8.0  # px, of the farthest pixel: what is seen in part has not moved more
 SETTLED = 0.01  # of the template's weight: trust changes no more
 
 
@@ -86,38 +86,32 @@ def solve(
     if not settings.robust:
         return found
     usual, on_cpu = expected_score(reference) if usual is None else usual, is_cpu(start.device)
-    odd = unusual(reference, found, usual)
-    if on_cpu and odd.any():
-        odd &= ~((residual_variance(found.sums) <= OUTLIER * least_noise(reference, settings)).all(1))
+    odd = unusual(reference, found, settings, usual)
     if on_cpu and not odd.any():
         return found
-    doubted, plain = Doubted.of(engine, reference, image, settings, usual), found
+    doubted, plain = Doubted.of(engine, reference, image, settings, usual), found._replace(trust=whole(found))
     if on_cpu:  # nowhere else does the host ask which ones
-        doubted, plain = doubted.at(odd), each(lambda value: value[odd], found)
+        doubted, plain = doubted.at(odd), part_of(plain, odd)
     uneven = has_outliers(doubted, plain)
     doubtful = uneven | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
     if on_cpu:
         if not doubtful.any():
             return found
-        doubted, plain = doubted.at(doubtful), each(lambda value: value[doubtful], plain)
-        uneven, doubtful = uneven[doubtful], doubtful[doubtful]
-    plain = plain._replace(trust=torch.ones_like(plain.sums[:, 0]))
-    match = torch.maximum(correlation(plain.normal, plain.total), detrended(plain.normal, plain.total))
-    familiar = match >= FAMILIAR * doubted.usual
-    again, fits = solved_again(doubted, start, plain, familiar)
-    # Noise may have grown in all of the patch, or light be another: then least squares is right, and leaving out most
-    # of it is not.
-    most = again.normal.total >= LEAST_COVERAGE * again.sums[:, 0].sum(1)
-    again = chosen(doubtful & (uneven | fits) & (most | ~familiar), again, plain)
-    found = found._replace(trust=torch.ones_like(found.sums[:, 0]))
-    return each(lambda old, new: old.index_copy(0, doubted.which, new), found, again)
+        doubted, plain, uneven = doubted.at(doubtful), part_of(plain, doubtful), uneven[doubtful]
+        doubtful = doubtful[doubtful]
+    again = solved_again(doubted, start, plain, uneven)
+    answer = chosen(doubtful, again, plain)
+    return each(lambda old, new: old.index_copy(0, doubted.which, new), found._replace(trust=whole(found)), answer)
 
 
-def unusual(reference: Reference, found: Solution, usual: Tensor) -> Tensor:
-    """Which templates (B,) have blocks with residuals that would be too much even for noise as it is ``usual`` (B,):
-    others need no scale of this frame's own."""
-    most = usual_variance(found.normal, found.gain, usual) * OUTLIER
-    return ~((residual_variance(found.sums) * reference.blocks.enough).amax(1) <= most)  # NaN is unusual
+def unusual(reference: Reference, found: Solution, settings: Settings, usual: Tensor) -> Tensor:
+    """Which templates (B,) have blocks with residuals that would be too much even for noise as it is ``usual`` (B,), or
+    the least there is: others need no scale of this frame's own."""
+    worst = (residual_variance(found.sums) * reference.blocks.enough).amax(1)
+    odd = ~(worst <= OUTLIER * usual_variance(found.normal, found.gain, usual))  # NaN is unusual
+    if is_cpu(worst.device) and not odd.any():
+        return odd
+    return odd & ~(worst <= OUTLIER * least_noise(reference, settings)[:, 0])
 
 
 def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
@@ -126,29 +120,38 @@ def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
     return ~(ratio <= OUTLIER).all(1)
 
 
-def solved_again(doubted: Doubted, start: Tensor, plain: Solution, familiar: Tensor) -> tuple[Solution, Tensor]:
-    """The best, and whether it fits (n,), of what trust leads to that begins with the residuals of least squares, or
-    with those under a median fit, at the ``start`` (B, 3) or where least squares has come to, and has not slid away.
+def solved_again(doubted: Doubted, start: Tensor, plain: Solution, uneven: Tensor) -> Solution:
+    """The best of the ``plain`` answer, whose blocks are ``uneven`` (n,), and of those that trust leads to.
 
-    Where the ``plain`` answer looks ``familiar`` (n,) and the first trial is no better, no other is made.
+    Noise may have grown in all of the patch, or light be another: then least squares is right, and leaving out most of
+    it is not.
     """
+    match = torch.maximum(correlation(plain.normal, plain.total), detrended(plain.normal, plain.total))
+    recognised = match >= RECOGNISED * doubted.usual
+    best, fits = best_trial(doubted, start, plain, recognised)
+    most = best.normal.total >= LEAST_COVERAGE * best.sums[:, 0].sum(1)
+    return chosen((uneven | fits) & (most | ~recognised), best, plain)
+
+
+def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Tensor) -> tuple[Solution, Tensor]:
+    """The best, and whether it fits (n,), of the ``plain`` answer and those that trust leads to if it begins with the
+    residuals of least squares, or with those under a median fit, at the ``start`` (B, 3) or where least squares has
+    come to, and has not slid away. Where least squares has ``recognised`` (n,) the template and the first trial is no
+    better, no other is made."""
     there = start.index_copy(0, doubted.which, plain.pose)
     here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
     first = usual_scale(doubted, plain.gain, SLIP), compared(doubted, variance, seen, any_scale(doubted))[1]
-    best, (least, fits) = plain._replace(trust=torch.ones_like(seen)), cost(doubted, plain, plain.gain)
-    brightest = BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
-    least = CLEARLY_LESS * least
+    best, (least, fits) = plain, cost(doubted, plain, plain.gain)
+    least, brightest = CLEARLY_LESS * least, BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
     trials: list[tuple[Tensor, tuple[Scale, Tensor] | None]] = [(there, first), (start, None), (there, None)]
     for place, begin in trials if is_cpu(start.device) else trials[:1]:  # elsewhere all templates would go through all
         found = reweighted(doubted, place, begin or median_look(doubted, place))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
-        near = torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < BASIN
-        better = (price < least) & near
-        best = chosen(better, found, best)
+        better = (price < least) & (torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST)
+        best, recognised = chosen(better, found, best), recognised & ~better
         least, fits = torch.where(better, price, least), torch.where(better, well, fits)
-        familiar = familiar & ~better
-        if is_cpu(start.device) and bool((fits | familiar).all()):
+        if is_cpu(start.device) and bool((fits | recognised).all()):
             break
     return best, fits
 
@@ -215,6 +218,16 @@ def usual_variance(normal: Normal, gain: Tensor, usual: Tensor) -> Tensor:
 def chosen(better: Tensor, new: Solution, old: Solution) -> Solution:
     """Of n templates the ``new`` answer where it is ``better`` (n,)."""
     return each(lambda a, b: torch.where(better.view(-1, *[1] * (a.dim() - 1)), a, b), new, old)
+
+
+def part_of(found: Solution, some: Tensor) -> Solution:
+    """That of ``some`` templates (B,) bool."""
+    return each(lambda value: value[some], found)
+
+
+def whole(found: Solution) -> Tensor:
+    """Trust (B, blocks) in all there is."""
+    return torch.ones_like(found.sums[:, 0])
 
 
 def trust(ratio: Tensor) -> Tensor:
