@@ -126,9 +126,9 @@ def solved_again(doubted: Doubted, start: Tensor, plain: Solution, uneven: Tenso
     Noise may have grown in all of the patch, or light be another: then least squares is right, and leaving out most of
     it is not.
     """
-    match = torch.maximum(correlation(plain.normal, plain.total), detrended(plain.normal, plain.total))
-    recognised = match >= RECOGNISED * doubted.usual
-    best, fits = best_trial(doubted, start, plain, recognised)
+    score, least = correlation(plain.normal, plain.total), RECOGNISED * doubted.usual
+    best, fits = best_trial(doubted, start, plain, score >= least)
+    recognised = torch.maximum(score, detrended(plain.normal, plain.total)) >= least
     most = best.normal.total >= LEAST_COVERAGE * best.sums[:, 0].sum(1)
     return chosen((uneven | fits) & (most | ~recognised), best, plain)
 
@@ -148,7 +148,8 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
     for place, begin in trials if is_cpu(start.device) else trials[:1]:  # elsewhere all templates would go through all
         found = reweighted(doubted, place, begin or median_look(doubted, place))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
-        better = (price < least) & (torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST)
+        better = torch.where(well == fits, price < least, well)  # what fits most of it, or else what leaves less
+        better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
         best, recognised = chosen(better, found, best), recognised & ~better
         least, fits = torch.where(better, price, least), torch.where(better, well, fits)
         if is_cpu(start.device) and bool((fits | recognised).all()):

@@ -151,15 +151,15 @@ def expected_score(reference: Reference) -> Tensor:
     return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
 
 
-def shortfall(score: Number, best: Number) -> Number:
-    """By how much a ``score`` s is worse than one as good as the ``best``: (1 - s) - a (1 - s_best) - b, any shape."""
+def just_as_good(best: Number) -> Number:
+    """The least score s that is as good as the ``best`` one, any shape: 1 - s = a (1 - s_best) + b."""
     a, b = AMBIGUITY_MARGIN
-    return 1 - score - a * (1 - best) - b
+    return 1 - a * (1 - best) - b
 
 
 def within_margin(score: Tensor, best: Tensor) -> Tensor:
-    """Whether a ``score`` is as good as the ``best`` one, any shape: bool."""
-    return shortfall(score, best) <= 0
+    """Whether a ``score`` s is as good as the ``best`` one, any shape: bool."""
+    return score >= just_as_good(best)
 
 
 def correlation(normal: Normal, total: Tensor) -> Tensor:

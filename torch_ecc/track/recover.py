@@ -20,7 +20,7 @@ from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
-from torch_ecc.core.verdict import expected_score, noise_share, shortfall, unknown, within_margin
+from torch_ecc.core.verdict import expected_score, just_as_good, noise_share, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import Nearby
@@ -52,7 +52,7 @@ class Past(NamedTuple):
 def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
     """Templates that were not found, or look less like themselves than ``usual`` (R,): perhaps a wrong place."""
     each = zip(estimate.status.tolist(), estimate.score.tolist(), usual.tolist(), strict=True)
-    return [status > Status.MAX_ITERATIONS or shortfall(score, most) > 0 for status, score, most in each]
+    return [status > Status.MAX_ITERATIONS or score < just_as_good(most) for status, score, most in each]
 
 
 def plausible(estimate: Estimate, start: Tensor, past: Past, radius: Tensor) -> Tensor:
