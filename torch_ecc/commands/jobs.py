@@ -175,6 +175,8 @@ def span(frames: str | None) -> slice:
         raise ValueError(f"frames: expected FIRST:LAST:STEP, whole numbers from 0 on, got {frames!r}")
     if len(parts) == 1 and first is not None:
         last = first
+    if last is not None and last < (first or 0):
+        raise ValueError(f"frames: expected LAST not to be before FIRST, got {frames!r}")
     return slice(first, None if last is None else last + 1, step)
 
 

@@ -114,6 +114,8 @@ class FrameSource:
             if frame.pixels is not None:
                 break
         else:
+            if not begun and numbers is not None:
+                raise ValueError(f"open_frames: {name} holds none of the frames that were asked for")
             reason = f" ({self._frame(begun[0]).damage})" if begun else ""
             raise ValueError(f"open_frames: {name} holds no frame that can be read{reason}")
         self.first, self._first = frame.pixels, frame.name or f"frame {frame.number}"
