@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,6 +26,7 @@ _FOUND = ("CONVERGED", "MAX_ITERATIONS")  # with every other status the pose is 
 _BINS = 1500  # more points than this per curve would only be drawn on top of each other
 _NEEDED = ("displacement", "covariance", "score", "status", "residual_rms", "status_codes", "status_names")
 _MOSAIC = "xa;yb;tc;sr;wr"  # x, y, theta beside their sigma a, b, c; score and status words beside the residual
+_WIDTH, _TOP, _BOTTOM = 12.5, 0.8, 0.85  # inches: of all, and of what is above and below the curves
 
 
 class _Track(NamedTuple):
@@ -57,16 +57,22 @@ def plot_track(
     """
     data = _load(track)
     templates = data.score.shape[1]
-    figure = Figure(figsize=(12.5, 8.8 + 0.12 * min(templates, 16)), layout=ConstrainedLayoutEngine(wspace=0.04))
+    height = 8.8 + 0.12 * min(templates, 16)
+    figure = Figure(figsize=(_WIDTH, height))
     strip = 0.14 + 0.06 * min(templates, 16)
+    room = {"left": 0.065, "right": 0.93 if templates > len(_COLOURS) else 0.985, "wspace": 0.23, "hspace": 0.13}
+    # By hand: matplotlib's own layout draws everything twice.
+    room |= {"top": 1 - _TOP / height, "bottom": _BOTTOM / height}
     ratios = {"width_ratios": (2.1, 1), "height_ratios": (1, 1, 1, 0.72, strip)}
-    axes = figure.subplot_mosaic(_MOSAIC, sharex=True, gridspec_kw=ratios)
+    axes = figure.subplot_mosaic(_MOSAIC, sharex=True, gridspec_kw=ratios | room)
     colours = _choose_colours(templates)
     _draw_motion(axes, data, colours)
     _draw_quality(axes, data, colours)
     _draw_status(axes["w"], data)
     for axis in axes.values():
         _dress(axis)
+    for name, axis in axes.items():
+        axis.yaxis.set_label_coords(-0.085 if name in _MOSAIC[::3] else -0.17, 0.5)
     for name in "wr":
         axes[name].set_xlabel(data.time_label)
     _annotate(figure, data, colours, title)
@@ -128,10 +134,10 @@ def _draw_motion(axes: Mapping[str, Axes], data: _Track, colours: list[Any]) -> 
     """Left the displacement with its band, right the sigma, which is mostly too small to see on the left."""
     small = "nm" if data.unit == "µm" else "10⁻³ px"
     units = ((data.unit, small), (data.unit, small), ("deg", "10⁻³ deg"))
-    for k, (symbol, (unit, sigma_unit)) in enumerate(zip(("x", "y", r"\theta"), units, strict=True)):
+    for k, (symbol, (unit, sigma_unit)) in enumerate(zip("xyθ", units, strict=True)):
         left, right = axes["xyt"[k]], axes["abc"[k]]
-        left.set_ylabel(f"${symbol}$ displacement ({unit})")
-        right.set_ylabel(rf"$\sigma_{symbol}$ ({sigma_unit})")
+        left.set_ylabel(f"{symbol} displacement ({unit})")
+        right.set_ylabel(f"\u03c3 of {symbol} ({sigma_unit})")
         value, sigma = data.displacement[..., k], data.sigma[..., k]
         for r, colour in enumerate(colours):
             _band(left, data.time, value[:, r], 3 * sigma[:, r], colour)
@@ -217,14 +223,16 @@ def _annotate(figure: Figure, data: _Track, colours: list[Any], title: str) -> N
     """Title, what each colour is, and what each status is that occurs."""
     frames, templates = data.status.shape
     count = f"{frames:,} frame{'s' * (frames > 1)}, {templates} template{'s' * (templates > 1)}"
-    figure.align_ylabels()
-    figure.suptitle(f"{title}   ({count})" if title else count, fontsize=13)
+    _, height = figure.get_size_inches()
+    figure.suptitle(f"{title}   ({count})" if title else count, fontsize=13, y=1 - 0.15 / height, va="top")
     if templates > len(_COLOURS):
         norm = Normalize(0, templates - 1)
-        figure.colorbar(ScalarMappable(norm, "viridis"), ax=figure.axes, label="template", aspect=60, pad=0.01)
+        bar = figure.add_axes((0.945, _BOTTOM / height, 0.01, 1 - (_BOTTOM + _TOP) / height))
+        figure.colorbar(ScalarMappable(norm, "viridis"), cax=bar, label="template")
     elif templates > 1:
         handles = [Patch(color=colour, label=f"template {r}") for r, colour in enumerate(colours)]
         figure.axes[0].legend(handles=handles, ncols=templates, loc="lower left", bbox_to_anchor=(0, 1), frameon=False)
     shades, seen = _status_colours(data.words), np.unique(data.status)
     handles = [Patch(color=shades[data.words[k]], label=data.words[k].replace("_", " ").lower()) for k in seen]
-    figure.legend(handles=handles, ncols=len(handles), loc="outside lower center", frameon=False)
+    place = (0.5, 0.02 / height)
+    figure.legend(handles=handles, ncols=len(handles), loc="lower center", bbox_to_anchor=place, frameon=False)
