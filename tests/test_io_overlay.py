@@ -145,7 +145,7 @@ def test_labels_do_not_cover_each_other_or_leave_the_frame(tmp_path):
 def test_a_crowd_gets_numbers_only(tmp_path):
     poses = [(30.0 + 40 * i, 40.0 + 40 * j, 0.0) for i in range(15) for j in range(11)]
     picture = drawn(tmp_path, GREY, found_at(*poses), shapes=[(31, 31)] * len(poses))
-    assert (picture.max(-1) < 40).mean() < 0.25
+    assert (picture.max(-1) < 40).mean() < 0.35
 
 
 # ---- frames of any kind --------------------------------------------------------------------------------------------

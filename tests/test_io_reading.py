@@ -285,9 +285,26 @@ def test_video(tmp_path, name, codec, loss):
         found = stacked(source)
         assert found.dtype == np.uint8
         assert found.shape == (30, 48, 64)
-        colours = np.stack([frame.picture().numpy() for frame in source])
+        colours = np.stack([frame.picture().reshape(-1, 48, 64).numpy() for frame in source])
         assert np.abs(colours.astype(int) - frames[:, None]).max() <= loss
         assert [frame.time_s for frame in source] == pytest.approx([k / 20 for k in range(30)], abs=1e-9)
+
+
+@pytest.mark.parametrize(("codec", "pixel"), [("mjpeg", "yuvj420p"), ("libx264", "yuv420p"), ("libx264", "yuv444p")])
+def test_a_grey_video_shows_the_grey_that_its_colours_would_be(tmp_path, codec, pixel):
+    """No colours are made for it, and its darkest and brightest stay black and white."""
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=20, options={"crf": "1"} if codec == "libx264" else {})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, pixel
+        for picture in ramps(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "gray")))
+        container.mux(stream.encode())
+    with av.open(str(path)) as container:
+        made = [frame.to_ndarray(format="gray").astype(int) for frame in container.decode(video=0)]
+    for frame, wanted in zip(open_frames(path), made, strict=True):
+        assert frame.picture().shape == (48, 64)
+        assert np.abs(frame.picture().numpy() - wanted).max() <= 2
 
 
 def test_video_is_rgb(tmp_path):

@@ -5,6 +5,7 @@ Everything is given in frame pixels and sized to the picture, so that it reads t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from math import ceil, floor
 from pathlib import Path
@@ -88,13 +89,19 @@ class Canvas:
         placed: NDArray[np.float64] = (points + 0.5) * self._zoom - 0.5
         return placed
 
-    def line(self, points: NDArray[np.float64], colour: Colour, *, closed: bool = False, width: float = 1.0) -> None:
-        """A line through (N, 2) frame points, with a dark rim that keeps it visible on any texture."""
-        fixed = np.round(self.place(points) * (1 << _SHIFT)).clip(-_FAR, _FAR).astype(np.int32)[:, None]
+    def lines(
+        self, points: Sequence[NDArray[np.float64]], colour: Colour, *, closed: bool = False, width: float = 1.0
+    ) -> None:
+        """Lines through (N, 2) frame points each, with a dark rim that keeps them visible on any texture."""
+        fixed = [self._fixed(each) for each in points]
         thickness = max(1, round(width * self.scale))
         rim = thickness + 2 * max(1, round(0.6 * self.scale))
         for shade, size in ((_DARK, rim), (colour, thickness)):
-            cv2.polylines(self.image, [fixed], closed, shade, size, cv2.LINE_AA, _SHIFT)
+            cv2.polylines(self.image, fixed, closed, shade, size, cv2.LINE_AA, _SHIFT)
+
+    def _fixed(self, points: NDArray[np.float64]) -> NDArray[np.int32]:
+        """(N, 1, 2) in OpenCV's fractions of a pixel."""
+        return np.round(self.place(points) * (1 << _SHIFT)).clip(-_FAR, _FAR).astype(np.int32)[:, None]
 
     def measure(self, text: str) -> tuple[int, int]:
         """Width and height in canvas px of the label that ``text`` makes."""
@@ -110,16 +117,12 @@ class Canvas:
     def label(self, spot: Box, text: str, colour: Colour) -> None:
         """``text`` on dark ground with an edge of ``colour``, at a ``spot`` of the canvas as large as ``measure``."""
         ground = self.image[spot.y : spot.y + spot.h, spot.x : spot.x + spot.w]
-        ground[:] = ground * np.float32(0.3)
-        tint = (np.array(WHITE, np.float32) + np.array(colour, np.float32)) / 2
+        ground[:] = _DARK
         for number, line in enumerate(text.split("\n")):
-            ink = (
-                np.hstack([_glyph(self._size, letter) for letter in line]) if line else np.zeros((0, 0, 1), np.float32)
-            )
+            ink = np.hstack([_glyph(self._size, letter, colour) for letter in line or " "])
             top = self.gap + number * (_height(self._size) + self.gap)
             under = ground[top : top + ink.shape[0], 3 * self.gap : 3 * self.gap + ink.shape[1]]
-            ink = ink[: under.shape[0], : under.shape[1]]
-            under[:] = under + ink * (tint - under)
+            under[:] = ink[: under.shape[0], : under.shape[1]]
         ground[:, : self.gap] = colour
 
 
@@ -132,12 +135,14 @@ def _load_font(size: int) -> ImageFont.FreeTypeFont:
 
 
 @cache
-def _glyph(size: int, letter: str) -> NDArray[np.float32]:
-    """How much ink a letter leaves where, (h, w, 1) in [0, 1]: drawn once, since labels change in every frame."""
+def _glyph(size: int, letter: str, colour: Colour) -> NDArray[np.uint8]:
+    """A letter in half of a ``colour`` on dark ground, (h, w, 3): drawn once, since labels change in every frame."""
     font = _load_font(size)
-    ink = Image.new("L", (_width(size, letter), _height(size)))
-    ImageDraw.Draw(ink).text((0, -_top(size)), letter, 255, font)
-    return np.asarray(ink, np.float32)[..., None] / np.float32(255)
+    mask = Image.new("L", (_width(size, letter), _height(size)))
+    ImageDraw.Draw(mask).text((0, -_top(size)), letter, 255, font)
+    ink = np.asarray(mask, np.float32)[..., None] / 255
+    dark, tint = np.array(_DARK), (np.array(WHITE) + np.array(colour)) / 2
+    return np.asarray((dark + ink * (tint - dark)).round(), np.uint8)
 
 
 @cache

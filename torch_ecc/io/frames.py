@@ -50,13 +50,14 @@ class Frame:
     colours: Callable[[], Pixels] | None = None
 
     def picture(self) -> Tensor:
-        """For people: (3, H, W) RGB where the source has colours, else ``pixels``; made when it is asked for.
+        """For people: (3, H, W) RGB, or (H, W) where the source has no colours; made when it is asked for.
         ValueError if the frame is damaged."""
         if self.pixels is None:
             raise ValueError(self.damage)
         if self.colours is None:
             return self.pixels
-        return torch.from_numpy(_convert(self.colours())).permute(2, 0, 1)
+        picture = torch.from_numpy(_convert(self.colours()))
+        return picture.permute(2, 0, 1) if picture.dim() == 3 else picture
 
 
 class Raw(NamedTuple):

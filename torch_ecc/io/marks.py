@@ -66,12 +66,10 @@ class Mark(NamedTuple):
 def draw(canvas: Canvas, mark: Mark) -> None:
     """Everything but the label."""
     if len(mark.trail) > 1:
-        canvas.line(np.stack(tuple(mark.trail)), _TRAIL)
-    for line in mark.outlines:
-        canvas.line(mark.on_frame(line), mark.colour, closed=True, width=1.5)
+        canvas.lines([np.stack(tuple(mark.trail))], _TRAIL)
+    canvas.lines([mark.on_frame(line) for line in mark.outlines], mark.colour, closed=True, width=1.5)
     reach = float(np.vstack(mark.outlines).max(0).min())
-    for axis in _cross(max(0.12 * reach, 4 * canvas.step)):
-        canvas.line(mark.on_frame(axis), mark.colour)
+    canvas.lines([mark.on_frame(axis) for axis in _cross(max(0.12 * reach, 4 * canvas.step))], mark.colour)
 
 
 def _cross(arm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

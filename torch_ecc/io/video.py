@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import av
+import cv2
 import numpy as np
-from av.video.reformatter import VideoReformatter
+from av.video.plane import VideoPlane
+from av.video.reformatter import ColorRange, VideoReformatter
 
 from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_size
 
@@ -20,6 +22,10 @@ VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
 _SLACK_FRAMES, _SLACK = 3, 0.02
 _STRICT = {"err_detect": "explode"}  # a frame that is damaged is told, and not made up from its neighbours
 _PACKED = {"yuyv422": 0, "yvyu422": 0, "uyvy422": 1}  # where the first luma byte stands among chroma bytes
+
+_PLANAR = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p")
+_NEUTRAL = np.uint8(127), 2  # chroma from that to so much more, as coders round it, is grey
+_FULL = ((np.arange(256) - 16) * (255 / 219)).round().clip(0, 255).astype(np.uint8)  # of luma from 16 to 235
 
 _conversion = threading.local()  # to colours: made once for a thread, and not, six times as dear, for each frame
 
@@ -130,7 +136,7 @@ def _raw(number: int, frame: _Decoded, time_s: float | None) -> Raw:
     gray = _luma(frame)
     if gray is None:
         return Raw(number, np.rot90(_rgb(frame), turns), time_s)
-    colours = (lambda: np.rot90(_rgb(frame), turns)) if len(frame.format.components) > 1 else None
+    colours = (lambda: np.rot90(_shown(frame), turns)) if len(frame.format.components) > 1 else None
     return Raw(number, np.rot90(gray, turns), time_s, colours=colours)
 
 
@@ -150,6 +156,24 @@ def _luma(frame: av.VideoFrame) -> Pixels | None:
     dtype = "u1" if first.bits == 8 else ">u2" if form.is_big_endian else "<u2"
     rows: Pixels = np.ndarray((frame.height, plane.line_size // np.dtype(dtype).itemsize), dtype, memoryview(plane))
     return rows[:, : frame.width].copy() if packed is None else rows[:, packed : 2 * frame.width : 2].copy()
+
+
+def _shown(frame: av.VideoFrame) -> Pixels:
+    """The picture, (H, W, 3), or (H, W) where all of its colours are grey, as of most cameras that measure."""
+    if frame.format.name not in _PLANAR or frame.planes[0].line_size < 0:
+        return _rgb(frame)
+    luma, *chroma = (_bytes(plane) for plane in frame.planes)
+    least, more = _NEUTRAL
+    if any((plane - least > more).any() for plane in chroma):
+        return _rgb(frame)
+    full = frame.format.name.startswith("yuvj") or frame.color_range == ColorRange.JPEG
+    return luma if full else np.asarray(cv2.LUT(luma, _FULL), np.uint8)
+
+
+def _bytes(plane: VideoPlane) -> Pixels:
+    """The pixels (h, w) of a plane of bytes, where they are."""
+    rows: Pixels = np.ndarray((plane.height, plane.width), np.uint8, memoryview(plane), 0, (plane.line_size, 1))
+    return rows
 
 
 def _rgb(frame: av.VideoFrame) -> Pixels:
