@@ -17,9 +17,11 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+import torch_ecc
 from torch_ecc import cli
 from torch_ecc.cli import app, main
 from torch_ecc.commands.track import Session, TrackJob
+from torch_ecc.core import library
 from torch_ecc.sim.scene.waves import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=2)
@@ -42,6 +44,15 @@ def video(tmp_path):
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "torch_ecc", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_the_version_tells_the_engine():
+    """Which instructions, or why there is none."""
+    done = run("--version")
+    assert done.returncode == 0
+    version, engine = f"torch-ecc {torch_ecc.__version__}, torch {torch.__version__}", library.describe()
+    assert done.stdout == f"{version}, engine: {engine}\n"
+    assert engine.startswith("native, ") == (library.load() is not None)
 
 
 def test_track_writes_everything(video, tmp_path):

@@ -1,14 +1,16 @@
-"""What is the native engine's own: compiled once, perhaps missing, and no call of its operator ends a process."""
+"""What is the native engine's own: how it reads templates and frames; and no call of its operator ends a process."""
 
 from __future__ import annotations
 
+import copy
 import gc
 import json
 import os
+import pickle
 import subprocess
 import sys
 import weakref
-from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
 
 import operator_calls
 import pytest
@@ -18,6 +20,7 @@ from engines import CRITERIA, FRAME, SCENE, Problem, compiled
 from torch_ecc import ECC, SSD, PaperECC, Status, Tracker, align, prepare
 from torch_ecc.core import native, reference
 from torch_ecc.core.settings import Settings
+from torch_ecc.core.solution import Trust
 
 
 @compiled
@@ -221,32 +224,91 @@ def test_no_direct_call_of_the_operator_ends_the_process(name, outcomes):
     assert outcome != "answer" or name not in operator_calls.WRONG
 
 
-def test_without_a_compiler_torch_serves(tmp_path):
-    """One clear line if the native engine was asked for, none otherwise, and the same answer."""
-    code = """
-import sys, torch, torch_ecc as te
-frame = torch.rand(60, 60)
-print(te.Tracker(frame, [(30, 30)], 21, backend=sys.argv[1]).track(frame).pose.round().abs().tolist())
-"""
-    environment = {"PATH": "", "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(Path(native.__file__).parents[2])}
-    for backend, expected in (("native", "no C++ compiler"), ("auto", "")):
-        command = [sys.executable, "-c", code, backend]
-        run = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
-        assert run.stdout.strip() == "[[30.0, 30.0, 0.0]]"
-        assert expected in run.stderr
-        assert ("torch page serves" in run.stderr) == (backend == "native")
+@compiled
+@pytest.mark.parametrize("trusting", [False, True])
+def test_the_operator_is_what_it_says(trusting):
+    """To torch.compile and torch.export: its schema, its fake results and its values."""
+    arguments = operator_calls.valid()
+    blocks = torch.ops.torch_ecc.solve(*arguments.values())[4].shape[-1]
+    trust = {"trust": torch.rand(2, blocks), "which": torch.tensor([2, 0])} if trusting else {}
+    torch.library.opcheck(torch.ops.torch_ecc.solve.default, tuple(arguments.values()), trust)
+
+
+@compiled
+def test_the_operator_gives_what_a_call_gives():
+    """Compiled or not."""
+    prepared, image, start = Problem(count=3, place="border", enough=100).made(ECC())
+    found = native.solve(prepared, image, start, Settings())
+    how = (3, 15, 1e-3, 2)
+    again = torch.compile(torch.ops.torch_ecc.solve, backend="eager", fullgraph=True)(
+        image, start, *prepared.packed, *how
+    )
+    for one, other in zip(found[:6], again, strict=False):
+        assert torch.equal(one, other)
+
+
+@compiled
+def test_a_copied_reference_outlives_its_original():
+    """A copy has templates of its own, packed where they are."""
+    prepared, image, start = Problem(count=2).made(ECC())
+    expected = native.solve(prepared, image, start, Settings())
+    copies = copy.deepcopy(prepared), pickle.loads(pickle.dumps(prepared))
+    del prepared
+    for reference_ in copies:
+        torch.testing.assert_close(
+            native.solve(reference_, image, start, Settings()).pose, expected.pose, rtol=0, atol=0
+        )
+        assert reference_.packed.memory != b""
+
+
+@compiled
+def test_a_forked_process_solves_too():
+    """It has none of the threads that have served before."""
+    prepared, image, start = Problem(count=16).made(ECC())
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        expected = native.solve(prepared, image, start, Settings()).pose
+        child = os.fork()
+        if child == 0:
+            os._exit(0 if torch.equal(native.solve(prepared, image, start, Settings()).pose, expected) else 1)
+    finally:
+        torch.set_num_threads(before)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+@compiled
+def test_many_python_threads_at_once():
+    """Each has its own answer."""
+    problems = [Problem(count=8, seed=seed).made(ECC()) for seed in range(6)]
+    alone = [native.solve(*problem, Settings()).pose for problem in problems]
+    with ThreadPoolExecutor(6) as pool:
+        for _ in range(5):
+            together = pool.map(lambda problem: native.solve(*problem, Settings()).pose, problems)
+            assert all(torch.equal(a, b) for a, b in zip(alone, together, strict=True))
+
+
+@compiled
+@pytest.mark.parametrize(
+    ("image", "start", "trust"),
+    [
+        (torch.zeros(3, 1, 110, 130), torch.zeros(2, 3).double(), None),
+        (torch.zeros(1, 3, 110, 130), torch.zeros(2, 3).double(), None),
+        (torch.zeros(1, 1, 110, 130), torch.zeros(1, 3).double(), None),
+        (torch.zeros(1, 1, 110, 130), torch.zeros(2, 3).double(), Trust(torch.tensor([2]), torch.ones(1, 42))),
+        (torch.zeros(1, 1, 110, 130), torch.zeros(2, 3).double(), Trust(torch.tensor([-1]), torch.ones(1, 42))),
+        (torch.zeros(1, 1, 110, 130), torch.zeros(2, 3).double(), Trust(torch.tensor([0]), torch.ones(1, 41))),
+        (torch.zeros(1, 1, 110, 130), torch.zeros(2, 3).double(), Trust(torch.tensor([0]), torch.ones(1, 42).double())),
+        (torch.zeros(1, 1, 110, 130), torch.zeros(2, 3).double(), Trust(torch.tensor([0.0]), torch.ones(1, 42))),
+        (torch.zeros(1, 1, 110, 130), torch.zeros(2, 3).double(), Trust(torch.tensor([0]), torch.ones(1, 84)[:, ::2])),
+    ],
+)
+def test_what_would_be_read_beyond_its_end_is_refused(image, start, trust):
+    prepared, _, _ = Problem(count=2).made(ECC())
+    with pytest.raises(ValueError, match=r"(solve|trust): expected .* (got|gaps)"):
+        native.solve(prepared, image, start, Settings(), trust)
 
 
 def test_unknown_backend():
     with pytest.raises(ValueError, match=r"backend: expected one of \['auto', 'torch', 'native'\], got 'gpu'"):
         Settings(backend="gpu")
-
-
-@pytest.mark.parametrize(("compiler", "said"), [("false", "ended with status 1"), ("nosuchcompiler", "nosuchcompiler")])
-def test_a_compiler_that_fails_is_told_in_one_line(compiler, said, tmp_path):
-    code = "import torch_ecc as te, torch; te.Tracker(torch.rand(60, 60), [(30, 30)], 21).track(torch.rand(60, 60))"
-    environment = dict(os.environ, CXX=compiler, XDG_CACHE_HOME=str(tmp_path))
-    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment)
-    (line,) = [line for line in run.stderr.splitlines() if "torch page serves" in line]
-    assert said in line
-    assert len(line) < 300

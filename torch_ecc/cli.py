@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import Task as RichTask
 from rich.text import Text
 
+import torch_ecc
 from torch_ecc.commands.jobs import Align, CompareJob, TrackJob
 from torch_ecc.commands.options import given, options_of, read_polygons, read_scale, read_size, track_toml, write_new
 from torch_ecc.config import fill, read_toml
@@ -23,8 +24,27 @@ INTERRUPTED = 130
 console = Console(highlight=False)
 
 
+def _say_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    """And which engine serves on this computer's processor."""
+    if not wanted:
+        return
+    import torch
+
+    from torch_ecc.core.library import describe
+
+    console.print(f"torch-ecc {torch_ecc.__version__}, torch {torch.__version__}, engine: {describe()}", soft_wrap=True)
+    context.exit()
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
-@click.version_option(package_name="torch-ecc")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_say_version,
+    help="Show the version and the engine in use, and exit.",
+)
 def app() -> None:
     """Planar pose tracking of textured patches: x, y and theta to a thousandth of a pixel."""
 

@@ -7,19 +7,34 @@ images were rounded to whole numbers when the template was prepared (``reference
 
 from __future__ import annotations
 
+from functools import cached_property
+from struct import Struct
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_ecc.core.reference import LEVELS, Reference
+from torch_ecc.core.reference import BLOCK, LEVELS, Reference
+from torch_ecc.core.solution import SUMS
 
 LANES = 16  # pixels of the widest vector that an engine reads rows in: their pitch is a multiple of it
 MOST = 10  # columns
+PLANES = 7
+NUMBERS = 122  # of a template, Numbers in csrc/template.h
+MOMENTS = 225  # of it, normal.Moments
 
 
-class Packed(NamedTuple):
+GRID = Struct("@8q")  # Grid in csrc/engine.cpp
+
+
+class _Packed(NamedTuple):
+    tensors: list[Tensor]
+    widths: list[int]
+    steps: list[int]
+
+
+class Packed(_Packed):
     """B templates on one grid or two, the coarser one second, of each:
 
     ``planes`` (B, 7, h, pitch) int16: d/dx, d/dy and t of the instrument, of the signal, and the Wiener weights, 0
@@ -28,9 +43,29 @@ class Packed(NamedTuple):
     ``steps``: px between them.
     """
 
-    tensors: list[Tensor]
-    widths: list[int]
-    steps: list[int]
+    @cached_property
+    def results(self) -> list[Tensor]:
+        """Tensors of the shapes and dtypes that an engine answers with: those of ``entry.Answer``."""
+        (count, _, height, _), new = self.tensors[0].shape, self.tensors[2].new_empty
+        blocks = -(-height // BLOCK) * -(-self.widths[0] // BLOCK)
+        sums = new((count, SUMS, blocks), dtype=torch.float32)
+        single = new(count), new(count, dtype=torch.int64), new(count)
+        return [new((count, 3)), *single, sums, new((count, SUMS + 3)), new((count, MOMENTS))]
+
+    @cached_property
+    def memory(self) -> bytes:
+        """Where all this lies, as csrc/engine.cpp reads it; a single grid is the coarser one too."""
+        last = len(self.widths) - 1
+        return Struct("@q").pack(last) + self._grid(0) + self._grid(last)
+
+    def _grid(self, k: int) -> bytes:
+        planes, weight, numbers = self.tensors[3 * k : 3 * k + 3]
+        _, _, height, pitch = planes.shape
+        places = (tensor.data_ptr() for tensor in (planes, weight, numbers))
+        return GRID.pack(*places, height, pitch, self.widths[k], self.steps[k], weight.shape[:2] == (1, 1))
+
+    def __reduce__(self) -> tuple[type[Packed], tuple[object, ...]]:
+        return Packed, tuple(self)  # a copy lies elsewhere
 
 
 def pack(reference: Reference) -> Packed:

@@ -24,8 +24,7 @@ def described(default: T, words: str, known: Collection[str] = (), example: obje
 class Settings:
     """How to iterate and when to believe the result.
 
-    A ``backend`` of "auto" is the native engine on a CPU where it is there or can be compiled, "native" says so if it
-    cannot, "torch" never is.
+    A ``backend`` of "auto" or "native" is the native engine on a CPU or, where there is none and with a word, the page.
     """
 
     interpolation: str = described("bspline3", "how the frame is read between pixels; bilinear is fast", SAMPLERS)
@@ -34,9 +33,7 @@ class Settings:
     min_score: float = described(0.5, "below this correlation a template is lost")
     min_visible: float = described(0.25, "with less of its weight in sight a template is out of view")
     robust: bool = described(True, "blocks that do not fit, as of what covers a part of the template, count less")
-    backend: str = described(
-        "auto", "on a CPU; auto is native where that is compiled or can be", ("auto", "torch", "native")
-    )
+    backend: str = described("auto", "on a CPU; auto is native where that is installed", ("auto", "torch", "native"))
 
     @classmethod
     def of(cls, where: str, options: dict[str, str | float]) -> Self:

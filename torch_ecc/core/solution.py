@@ -13,6 +13,7 @@ from torch_ecc.core.normal import Normal
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 
+SUMS = 10  # rows of ``summed``
 FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 
 

@@ -13,6 +13,7 @@ struct Moments {  // normal.Moments
   Matrix normal, power;
   double gram[4][4], noise[2][4];
 };
+static_assert(sizeof(Moments) == 8 * ECC_MOMENTS);
 
 inline const std::vector<int> SHAPE{4, MOST, MOST + 1, 3};  // 1, u, v and t among `columns` of R
 

@@ -118,7 +118,7 @@ inline double finite(double value) { return std::isfinite(value) ? value : 0; }
 // seen: the weights without trust.
 inline void summed(const Template& t, const Pixels& p, const Weights& seen, const Weighted& w, const float* patch,
                    Model& m, float* lines, float* sums, double* total) {
-  const int64_t across = (p.width + BLOCK - 1) / BLOCK, count = across * ((p.height + BLOCK - 1) / BLOCK);
+  const int64_t across = blocks(p.width), count = across * blocks(p.height);
   const int n = t.lines();
   m.mean = float(m.sums[4] / w.total);
   m.t = float(p.shift(1) - w.along / w.total);

@@ -12,7 +12,8 @@
 namespace ecc {
 
 constexpr int MOST = ECC_MOST, SSD = -1, PAPER = -2;  // columns; criteria in place of a number of light columns
-constexpr int64_t BLOCK = ECC_BLOCK, SUMS = 10;       // px; rows of solution.summed
+constexpr int64_t BLOCK = ECC_BLOCK, SUMS = ECC_SUMS;  // px; rows of solution.summed
+inline int64_t blocks(int64_t n) { return (n + BLOCK - 1) / BLOCK; }  // along n px
 using Coefficients = std::array<double, MOST>;        // of [G, t less its mean, 1, t u, t v, t u^2, t v^2, t u v]
 using Matrix = double[MOST][MOST];
 
@@ -29,6 +30,7 @@ struct Numbers {  // packed._numbers
 };
 
 enum Plane { Z_X, Z_Y, Z_T, R_X, R_Y, R_T, WIENER, PLANES };
+static_assert(sizeof(Numbers) == 8 * ECC_NUMBERS && PLANES == ECC_PLANES);
 
 struct Weights {  // of rows that lie `pitch` apart: 0 if one row serves for all
   const float* at;

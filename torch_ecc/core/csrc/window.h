@@ -44,10 +44,11 @@ inline void store(const Vector& values, float* to) { std::memcpy(to, &values, si
 
 inline int64_t padded(int64_t n) { return (n + LANES - 1) / LANES * LANES; }
 
-struct Frame {  // rows of one grey frame where they are, in any of the three dtypes
-  const void* data;
-  int64_t h, w, stride;
-  enum { U8, U16, F32 } dtype;
+struct Frame {  // rows of one grey frame where they are: uint8, uint16 or float32, told by its bytes
+  const char* data;
+  int64_t bytes, h, w, stride;
+
+  Frame after(int64_t pixels) const { return {data + pixels * bytes, bytes, h, w, stride}; }
 };
 
 struct Window {  // values at frame positions (x0 .. x0 + w - 1, y0 .. y0 + h - 1)
@@ -72,7 +73,7 @@ void read_rows(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t h,
   constexpr int64_t LINE = 64 / sizeof(Pixel), AHEAD = 16;  // a frame is new: its rows are fetched ahead of their use
   const int64_t first = std::clamp<int64_t>(-x0, 0, w), last = std::clamp<int64_t>(frame.w - x0, first, w);
   const auto at = [&](int64_t j) {
-    return static_cast<const Pixel*>(frame.data) + within(y0 + j, frame.h, mirrored) * frame.stride;
+    return reinterpret_cast<const Pixel*>(frame.data) + within(y0 + j, frame.h, mirrored) * frame.stride;
   };
   for (int64_t j = 0; j < h; ++j, out += pitch) {
     const Pixel* const row = at(j);
@@ -85,9 +86,8 @@ void read_rows(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t h,
 
 inline void read(const Frame& frame, int64_t x0, int64_t y0, int64_t w, int64_t h, int64_t pitch, bool mirrored,
                  float* out) {
-  if (frame.dtype == Frame::U8) read_rows<uint8_t>(frame, x0, y0, w, h, pitch, mirrored, out);
-  if (frame.dtype == Frame::U16) read_rows<uint16_t>(frame, x0, y0, w, h, pitch, mirrored, out);
-  if (frame.dtype == Frame::F32) read_rows<float>(frame, x0, y0, w, h, pitch, mirrored, out);
+  const auto rows = frame.bytes == 1 ? read_rows<uint8_t> : frame.bytes == 2 ? read_rows<uint16_t> : read_rows<float>;
+  rows(frame, x0, y0, w, h, pitch, mirrored, out);
 }
 
 // Samples to coefficients of the interpolating B-spline, one pole z of the inverse filter after the other (Unser et

@@ -1,0 +1,70 @@
+"""The one entry of the compiled engine: tensors in, tensors out, by way of one record in memory (csrc/engine.cpp)."""
+
+from __future__ import annotations
+
+from struct import Struct
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.library import Library
+from torch_ecc.core.packed import Packed
+from torch_ecc.core.solution import Trust
+
+DTYPES = (torch.uint8, torch.uint16, torch.float32)  # of images
+FIELDS = ("pose", "error", "iterations", "gain", "sums", "total", "moments")  # of answers
+CALL = Struct("@20qdq")  # Call
+
+How = tuple[int, int, float, int]  # degree of the spline between pixels, max_iterations, tolerance, criterion
+
+
+def call(
+    library: Library, image: Tensor, start: Tensor, packed: Packed, how: How, trust: Trust | None = None
+) -> tuple[int, list[Tensor]]:
+    """Of the packed templates in (B or 1, 1, H, W) from ``start`` (B, 3), float64, on, or of those that ``trust`` is
+    about: how many are partial, because not all of their pixels count; and ``FIELDS``, see ``solution.Solution``.
+    ``moments`` (n, MOMENTS) make the normal equations of those that are partial; of others the first is -1.
+
+    Raises ValueError, MemoryError.
+    """
+    (many, channels, height, width), results, some = image.shape, packed.results, (0, 0)
+    count = len(results[0])
+    if start.shape != results[0].shape or channels != 1 or many not in {1, count}:
+        raise ValueError(
+            f"solve: expected start ({count}, 3), image (1 or {count}, 1, H, W), got {start.shape}, {image.shape}"
+        )
+    stride, start = image.stride(), start.contiguous()
+    if stride[3] != 1 or image.is_neg():
+        image = image.resolve_neg().contiguous()
+        stride = image.stride()
+    if trust is None:
+        results = [torch.empty_like(result) for result in results]  # the fastest way to a tensor
+    else:
+        results, some = (
+            [result.new_empty((len(trust.which), *result.shape[1:])) for result in results],
+            _places(trust, results[4]),
+        )
+    record = CALL.pack(
+        *(image.data_ptr(), image.element_size(), height, width, stride[2], stride[0] if many > 1 else 0),
+        *(start.data_ptr(), *some),
+        *[result.data_ptr() for result in results],
+        *(len(results[0]), torch.get_num_threads(), *how),
+    )
+    partial = library.solve(record + packed.memory)
+    if partial < 0:
+        raise MemoryError("solve: there is not enough memory for the images around the templates")
+    return partial, results
+
+
+def _places(trust: Trust, sums: Tensor) -> tuple[int, int]:
+    """Where its tensors lie. Raises ValueError if they are not about the blocks of ``sums`` (B, ..., blocks)."""
+    (which, value), (count, _, blocks) = trust, sums.shape
+    if which.dtype != torch.int64 or value.dtype != torch.float32 or value.shape != (len(which), blocks):
+        raise ValueError(
+            f"trust: expected int64 (n,) and float32 (n, {blocks}), got {which.dtype}, {value.dtype} {value.shape}"
+        )
+    if not (which.is_contiguous() and value.is_contiguous()):
+        raise ValueError("trust: expected tensors without gaps")
+    if len(which) and not 0 <= int(which.min()) <= int(which.max()) < count:
+        raise ValueError(f"trust: expected templates 0 to {count - 1}, got {which.tolist()}")
+    return which.data_ptr(), value.data_ptr()
