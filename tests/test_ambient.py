@@ -260,8 +260,9 @@ def test_the_number_of_threads_is_the_callers(wanted):
     seen, before = [], torch.get_num_threads()
 
     def fails() -> None:
-        with ambient.threads_for(100):
+        with ambient.threads_for(200), ambient.threads_for(100):
             seen.append(torch.get_num_threads())
+            assert ambient.threads_of_caller() == wanted
             raise KeyError
 
     torch.set_num_threads(wanted)
@@ -274,3 +275,4 @@ def test_the_number_of_threads_is_the_callers(wanted):
     finally:
         torch.set_num_threads(before)
     assert seen == [1, wanted, wanted]
+    assert ambient.threads_of_caller() == before

@@ -18,24 +18,26 @@ import torch
 from engines import CRITERIA, FRAME, SCENE, Problem, compiled
 
 from torch_ecc import ECC, SSD, PaperECC, Status, Tracker, align, prepare
-from torch_ecc.core import native, reference
+from torch_ecc.core import entry, native, reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Trust
 
 
 @compiled
-def test_threads_do_not_matter():
+def test_threads_do_not_matter(monkeypatch):
     """Each template is solved by one of them, in whatever order."""
     prepared, image, start = Problem(count=16, place="border", enough=100).made(ECC())
     before, found = torch.get_num_threads(), []
+    monkeypatch.setattr(entry, "PIXELS_PER_THREAD", 1)
     try:
-        for threads in (1, 2):
+        for threads in (1, 2, 5):
             torch.set_num_threads(threads)
             found.append(align(prepared, image, start, backend="native"))
     finally:
         torch.set_num_threads(before)
-    for one, two in zip(*found, strict=True):
+    for one, two, five in zip(*found, strict=True):
         assert torch.equal(one, two)
+        assert torch.equal(one, five)
 
 
 @compiled
@@ -262,11 +264,12 @@ def test_a_copied_reference_outlives_its_original():
 
 
 @compiled
-def test_a_forked_process_solves_too():
+def test_a_forked_process_solves_too(monkeypatch):
     """It has none of the threads that have served before."""
     prepared, image, start = Problem(count=16).made(ECC())
     before = torch.get_num_threads()
     torch.set_num_threads(2)
+    monkeypatch.setattr(entry, "PIXELS_PER_THREAD", 1)
     try:
         expected = native.solve(prepared, image, start, Settings()).pose
         child = os.fork()
@@ -278,8 +281,10 @@ def test_a_forked_process_solves_too():
 
 
 @compiled
-def test_many_python_threads_at_once():
-    """Each has its own answer."""
+def test_many_python_threads_at_once(monkeypatch):
+    """Each has its own answer, whoever's threads help."""
+    monkeypatch.setattr(entry, "PIXELS_PER_THREAD", 1)
+    monkeypatch.setattr(entry, "threads_of_caller", lambda: 3)
     problems = [Problem(count=8, seed=seed).made(ECC()) for seed in range(6)]
     alone = [native.solve(*problem, Settings()).pose for problem in problems]
     with ThreadPoolExecutor(6) as pool:

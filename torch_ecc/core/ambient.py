@@ -7,6 +7,7 @@ tensor is made with its own dtype and device.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
@@ -57,6 +58,14 @@ def lasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
     return plain(torch.inference_mode(False)(torch.no_grad()(function)))
 
 
+_here = threading.local()  # ``threads`` outside of ``threads_for``, None there
+
+
+def threads_of_caller() -> int:
+    """As many as there are outside of ``threads_for``, for those that wait for each other asleep."""
+    return getattr(_here, "threads", None) or torch.get_num_threads()
+
+
 @contextmanager
 def threads_for(pixels: int) -> Iterator[None]:
     """As many of the caller's threads as templates of so many ``pixels`` are worth; one for most.
@@ -64,10 +73,12 @@ def threads_for(pixels: int) -> Iterator[None]:
     Threads wait for each other at the end of every operation that they share, spinning: on a computer that also does
     something else, a tenth of a millisecond of work then takes as long as a time slice.
     """
-    most = torch.get_num_threads()
+    most, callers = torch.get_num_threads(), threads_of_caller()
     some = min(1 + pixels // PIXELS_PER_THREAD, most)
     torch.set_num_threads(some)
+    _here.threads = callers
     try:
         yield
     finally:
         torch.set_num_threads(most)
+        _here.threads = None if callers == most else callers

@@ -7,6 +7,7 @@ from struct import Struct
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import threads_of_caller
 from torch_ecc.core.library import Library
 from torch_ecc.core.packed import Packed
 from torch_ecc.core.solution import Trust
@@ -14,6 +15,7 @@ from torch_ecc.core.solution import Trust
 DTYPES = (torch.uint8, torch.uint16, torch.float32)  # of images
 FIELDS = ("pose", "error", "iterations", "gain", "sums", "total", "moments")  # of answers
 CALL = Struct("@20qdq")  # Call
+PIXELS_PER_THREAD = 2**19  # some 2 ms of work
 
 How = tuple[int, int, float, int]  # degree of the spline between pixels, max_iterations, tolerance, criterion
 
@@ -48,12 +50,18 @@ def call(
         *(image.data_ptr(), image.element_size(), height, width, stride[2], stride[0] if many > 1 else 0),
         *(start.data_ptr(), *some),
         *[result.data_ptr() for result in results],
-        *(len(results[0]), torch.get_num_threads(), *how),
+        *(len(results[0]), _threads(len(results[0]) * packed.pixels), *how),
     )
     partial = library.solve(record + packed.memory)
     if partial < 0:
         raise MemoryError("solve: there is not enough memory for the images around the templates")
     return partial, results
+
+
+def _threads(pixels: int) -> int:
+    """For so many of templates. They sleep while there is nothing to do; but one that is interrupted in its last
+    template has the others wait for a time slice, so that less work is not shared."""
+    return 1 if pixels < PIXELS_PER_THREAD else min(1 + pixels // PIXELS_PER_THREAD, threads_of_caller())
 
 
 def _places(trust: Trust, sums: Tensor) -> tuple[int, int]:

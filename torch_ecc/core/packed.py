@@ -53,6 +53,11 @@ class Packed(_Packed):
         return [new((count, 3)), *single, sums, new((count, SUMS + 3)), new((count, MOMENTS))]
 
     @cached_property
+    def pixels(self) -> int:
+        """Of each template."""
+        return self.tensors[0][0, 0].numel()
+
+    @cached_property
     def memory(self) -> bytes:
         """Where all this lies, as csrc/engine.cpp reads it; a single grid is the coarser one too."""
         last = len(self.widths) - 1
