@@ -67,7 +67,13 @@ TARGETS = {  # of wheels, built by zig; Linux as old as manylinux2014
     "linux-x86_64": Target(ZIG_X86, ELF, ".so", "x86_64-linux-gnu.2.17", "manylinux_2_17_x86_64"),
     "linux-aarch64": Target(ARM, ELF, ".so", "aarch64-linux-gnu.2.17", "manylinux_2_17_aarch64"),
     "windows-amd64": Target(ZIG_X86, ["-Wl,-s"], ".dll", "x86_64-windows-gnu", "win_amd64"),
-    "macos-arm64": Target(ARM, ["-fPIC", "-Wl,-s"], ".dylib", "aarch64-macos.11.0", "macosx_11_0_arm64"),
+    "macos-arm64": Target(
+        ARM,
+        ["-fPIC", "-Wl,-s", "-Wl,-install_name,@rpath/torch_ecc.dylib"],
+        ".dylib",
+        "aarch64-macos.11.0",
+        "macosx_11_0_arm64",
+    ),
 }
 
 
