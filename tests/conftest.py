@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from torch_ecc.core import robust, sampling, solver, verdict
+from torch_ecc.core import clinging, robust, sampling, solver, verdict
 
 settings.register_profile("untimed", parent=settings(), deadline=None)  # a busy machine is no failure
 settings.load_profile("untimed")
@@ -38,5 +38,5 @@ def data() -> Path:
 @pytest.fixture
 def blind(monkeypatch: pytest.MonkeyPatch) -> None:
     """The host looks at nothing in the midst of a solve, as on an accelerator."""
-    for module in (robust, sampling, solver, verdict):
+    for module in (clinging, robust, sampling, solver, verdict):
         monkeypatch.setattr(module, "is_cpu", lambda device: False)

@@ -22,11 +22,11 @@ from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.ambient import lasting
-from torch_ecc.core.criteria import Criterion, centred, make_criterion, safe_inverse
+from torch_ecc.core.blocks import Blocks, Parts, blocks_of, parts_of
+from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.noise import INSTRUMENT_BLUR, template_noise, wiener_weight
 from torch_ecc.core.normal import Moments, Normal, normal_equations
@@ -41,7 +41,6 @@ ENOUGH = 1500  # pixels of a template tell well where to go; the first iteration
 SPARSEST = 4  # px between those that are kept
 BLOCK = 6  # px: side of the blocks over which the last look at a patch is summed
 PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which takes some 600 bytes on the way
-HALF_FULL = 0.5  # of the fullest block's weight: a block with less of it tells too little
 SMALLEST = 5  # px: side of the smallest template
 LEVELS = 2**15 - 1  # a template is rounded to so many steps on either side: an engine may hold it in 16 bits
 
@@ -97,21 +96,6 @@ class Noise(NamedTuple):
     alias: dict[str, Tensor]
 
 
-class Blocks(NamedTuple):
-    """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean and of
-    its ``square``, the mean square of the texture's slopes, or of those around if that is more, ``slope``; and which of
-    those that hold pixels enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``:
-    either."""
-
-    weight: Tensor
-    t: Tensor
-    square: Tensor
-    slope: Tensor
-    flat: Tensor
-    steep: Tensor
-    enough: Tensor
-
-
 class Sight(NamedTuple):
     """Where a camera has ``shown`` (H, W) the scene, not a mark of its own; ``clear`` (H, W), where none bears on a
     block of pixels, ``well_clear`` (H, W), nor a little off; the blocks' ``middles`` (3, blocks). See ``sight``."""
@@ -160,7 +144,13 @@ class Reference(_Groups):
     @lasting
     def blocks(self) -> Blocks:
         """What the template has in each block, made once for as long as the reference lives."""
-        return _blocks(self)
+        return blocks_of(self)
+
+    @cached_property
+    @lasting
+    def parts(self) -> Parts:
+        """What each block adds to the normal equations: made once, if it is needed."""
+        return parts_of(self)
 
     @cached_property
     @lasting
@@ -302,21 +292,6 @@ def _place(grid: Grid, centre: Tensor, weight: Tensor) -> Place:
     half = (grid.box[:2, 2] - grid.box[:2, 0]).clamp(min=1.0)[:, None] / 2
     one = torch.eye(2, dtype=half.dtype, device=half.device).expand(len(centre), 2, 2)
     return Place(centre, radius, lever, lever.square(), torch.cat((one, -centre[:, :, None]), -1) / half)
-
-
-def _blocks(reference: Reference) -> Blocks:
-    grid, weight = reference.grid, reference.weight
-    t, _ = centred(reference.signal[:, 3], weight)
-    slopes = reference.columns.wiener * reference.signal[:, :2].square().sum(1)
-    rows = torch.stack((weight, weight * t, weight * t * t, weight * slopes), 1)
-    sums = rows.new_zeros(len(t), 4, grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
-    count, of_t, square, slope = sums.unbind(1)
-    slope = (slope / count.clamp(min=1e-30)).view(-1, *grid.blocks)
-    around = F.avg_pool2d(slope, 3, 1, 1, count_include_pad=False)  # blur brings edges from the next block
-    slope = torch.maximum(slope, around).flatten(1)
-    enough = count > HALF_FULL * count.amax(1, keepdim=True)
-    middle = torch.where(enough, slope, torch.nan).nanmedian(1, keepdim=True).values
-    return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle), enough)
 
 
 def _columns(local: Tensor, images: tuple[Tensor, Tensor], wiener: Tensor, weight: Tensor) -> Columns:

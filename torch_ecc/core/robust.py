@@ -14,8 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ecc.core.blocks import Blocks
 from torch_ecc.core.normal import LEAST, Normal
-from torch_ecc.core.reference import BLOCK, Blocks, Reference, each
+from torch_ecc.core.reference import BLOCK, Reference, each
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust

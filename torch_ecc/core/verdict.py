@@ -12,6 +12,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from torch_ecc.core.clinging import clinging
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.core.normal import LEAST, Normal
@@ -27,7 +28,6 @@ AMBIGUITY_MARGIN = (1.5, 0.01)  # (a, b): a score s is as good as the best if 1 
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
 NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps, but
 CHANCE = 42.0  # over the square root of the number of pixels: noise as such is within so much of all of it
-FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 DOUBTFUL_SHARE = 0.8  # of the noise that there may be, as the likely reason why a template was not found
 LEAST_CONTRAST = 0.1  # of the template's: what has less is flat, and so is what has no more than
 BARE_NOISE = 2.0  # times the template's noise
@@ -62,13 +62,15 @@ def judge(
     of_both = 1 + power  # variance of template and frame together
     # One image's noise v: of the residuals' mean square the template's part is gain^2 v, the frame's, sampled, NG v.
     variance = error / (power + SAMPLERS[settings.interpolation].noise_gain).mul_(normal.freedom)
-    scatter = cluster_robust(reference, normal, total[:, 10:] / of_both.unsqueeze(1), variance)
+    scatter, strained = clinging(reference, found, variance, of_both)
     alias = interpolation_error(reference, axes, settings.interpolation)
     covariance = pose_covariance(reference, normal, variance, of_both / power, axes, scatter, alias)
     visible, believed = seen_and_believed(reference, found)
     unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
     amounts = torch.stack((visible, match, found.gain, believed, *unobservable, found.error, score), 1)
-    status, failed = decide(amounts, settings)
+    status, failed = decide(amounts, settings)  # strain is no lack of texture
+    if strained is not None:
+        covariance = torch.baddbmm(covariance, torch.bmm(axes, strained), axes.mT)
     worst, rms = max(status.tolist()) if on_cpu else max(Status), (error / normal.total).sqrt()
     tracked = reason = _zeros(len(pose), pose.device)  # Origin.TRACKED, Reason.NONE
     if worst > Status.CONVERGED:
@@ -179,20 +181,6 @@ def detrended(normal: Normal, total: Tensor) -> Tensor:
     return torch.where(solid, tg * (tt * gg).clamp(min=torch.finfo(tg.dtype).tiny).rsqrt(), 0.0).clamp(-1, 1)
 
 
-def cluster_robust(reference: Reference, normal: Normal, clustered: Tensor, variance: Tensor) -> Tensor:
-    """Variance (B, 3) of the noise as each row of K feels it; never less than the ``variance`` (B,) of white noise.
-
-    What no noise model knows (edges that the sampler rounds, light, an occluder, blur) leaves residuals that cling
-    together where the gradients are. Their effect summed block by block, its squares ``clustered`` (B, 3), tells the
-    scatter that they bring (the cluster-robust sandwich).
-    """
-    blocks, columns = reference.grid.occupied, reference.K.shape[1]
-    if blocks < FEW_BLOCKS * columns:  # too few to tell a scatter from
-        return variance.unsqueeze(1)
-    free = blocks / (blocks - columns)  # blocks are not free: the fit has made their sum zero
-    return torch.maximum(clustered.div_(normal.white).mul_(free), variance.unsqueeze(1))
-
-
 def interpolation_error(reference: Reference, axes: Tensor, interpolation: str) -> Tensor | None:
     """What aliasing in the sampler shifts poses with ``axes`` (B, 3, 3), see ``pose.turn``, by: a square root (B, 3, 2)
     of its covariance in the template's axes; None where it does not count.
@@ -225,7 +213,7 @@ def pose_covariance(
     Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T, turned from the
     template's axes to the frame's. The template's noise is taken out of S, and out of P for its own part P_t: a
     derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 1 or 3): see
-    ``cluster_robust``, by default white; ``alias`` (B, 3, 2): see ``interpolation_error``.
+    ``clinging``, by default white; ``alias`` (B, 3, 2): see ``interpolation_error``.
     """
     bias = torch.minimum(variance, reference.noise.power)[:, None, None]
     bread = torch.addcmul(normal.bread, bias, normal.bread_bias, value=-1)

@@ -1,0 +1,87 @@
+"""What a template has in each block of its pixels, by which it is judged where it fits a frame and where not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torch_ecc.core.criteria import centred
+
+if TYPE_CHECKING:
+    from torch_ecc.core.reference import Reference
+
+HALF_FULL = 0.5  # of the fullest block's weight: a block with less of it tells too little
+
+
+class Blocks(NamedTuple):
+    """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean and of
+    its ``square``, the mean square of the texture's slopes, or of those around if that is more, ``slope``; and which of
+    those that hold pixels enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``:
+    either."""
+
+    weight: Tensor
+    t: Tensor
+    square: Tensor
+    slope: Tensor
+    flat: Tensor
+    steep: Tensor
+    enough: Tensor
+
+
+# By what parts of a target, at (x, y) about its centre, may move other than as one, and whether that is half a turn:
+# it grows; grows along x and shrinks along y; and so along the diagonals; bends, along y and along x; tilts, about y
+# and about x.
+STRAINS: tuple[tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], bool], ...] = (
+    (lambda x, y: (x, y), False),
+    (lambda x, y: (x, -y), True),
+    (lambda x, y: (y, x), True),
+    (lambda x, y: (y * y, -x * y), False),
+    (lambda x, y: (x * y, -x * x), False),
+    (lambda x, y: (x * x, x * y), False),
+    (lambda x, y: (x * y, y * y), False),
+)
+
+
+class Parts(NamedTuple):
+    """What the blocks of B templates add to sums over Z W (p rows), the last dimension of which they are: ``normal``
+    (B, p, p, blocks) those with R, ``strain`` (B, p, 7, blocks) with what the picture changes by in each of
+    ``STRAINS``, as large as moves the farthest pixel, ``radius`` (B,) px away, by some 1 px; ``weight`` (B, blocks)."""
+
+    normal: Tensor
+    strain: Tensor
+    weight: Tensor
+    radius: Tensor
+
+
+def blocks_of(reference: Reference) -> Blocks:
+    """Made of a prepared template."""
+    grid, weight = reference.grid, reference.weight
+    t, _ = centred(reference.signal[:, 3], weight)
+    slopes = reference.columns.wiener * reference.signal[:, :2].square().sum(1)
+    rows = torch.stack((weight, weight * t, weight * t * t, weight * slopes), 1)
+    sums = rows.new_zeros(len(t), 4, grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
+    count, of_t, square, slope = sums.unbind(1)
+    slope = (slope / count.clamp(min=1e-30)).view(-1, *grid.blocks)
+    around = F.avg_pool2d(slope, 3, 1, 1, count_include_pad=False)  # blur brings edges from the next block
+    slope = torch.maximum(slope, around).flatten(1)
+    enough = count > HALF_FULL * count.amax(1, keepdim=True)
+    middle = torch.where(enough, slope, torch.nan).nanmedian(1, keepdim=True).values
+    return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle), enough)
+
+
+def parts_of(reference: Reference) -> Parts:
+    """Made of a prepared template."""
+    columns, grid = reference.columns, reference.grid
+    R, Z = (reference.criterion.columns(v, reference.uv) for v in (columns.signal, columns.instrument))
+    place = (grid.pixels[:2] - reference.place.centre[:, :, None]) / reference.place.radius[:, None, None]
+    gx, gy, x, y = (v.to(R.dtype) for v in (*columns.signal[:, :2].unbind(1), *place.unbind(1)))
+    moved = [shape(x, y) for shape, _ in STRAINS]
+    both, (b, p) = torch.cat((R, torch.stack([gx * dx + gy * dy for dx, dy in moved], 1)), 1), R.shape[:2]
+    sums = R.new_zeros(b, p, both.shape[1], grid.blocks[0] * grid.blocks[1])
+    for k in range(p):
+        sums[:, k].index_add_(2, grid.block, both * (Z[:, k] * columns.weight)[:, None])
+    return Parts(sums[:, :, :p], sums[:, :, p:], reference.blocks.weight, reference.place.radius)
