@@ -7,6 +7,7 @@ gone together, that is where the others are looked for.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,7 +28,6 @@ from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allow
 from torch_ecc.track.max_step import MaxStep
 
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
-ANYWHERE_MARGIN = (2.0, 0.02)  # (a, b): a place of score s may be the template's if 1 - s <= a (1 - s_usual) + b
 AT_ONCE = 8  # templates searched for in the whole of one frame; the others in turn
 NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
@@ -41,16 +41,22 @@ TOGETHER = 3.0  # px: they have gone the same way, and more than half of those t
 
 
 class Past(NamedTuple):
-    """What is known of R templates before a frame: last good ``pose`` (R, 3), ``since`` (R,) how many frames, ``usual``
-    score (R,), ``suspect_frames`` (R,) in a row, and the ``first`` frame (1 or R, 1, H, W), where they were at ``home``
-    (R, 3)."""
+    """What is known of R templates before a frame: last good ``pose`` (R, 3), ``since`` (R,) how many frames, if a
+    search has ``found`` it (R,) 0 or 1, ``usual`` score (R,), ``suspect_frames`` (R,) in a row, and the ``first`` frame
+    (1 or R, 1, H, W), where they were at ``home`` (R, 3)."""
 
     pose: Tensor
     since: Tensor
+    found: Tensor
     usual: Tensor
     suspect_frames: Tensor
     first: Tensor
     home: Tensor
+
+    @staticmethod
+    def of(state: Mapping[str, Tensor]) -> Past:
+        """From a tracker's buffers."""
+        return Past(*(state[name] for name in ("pose", "since", "found", "score", "suspect_frames", "first", "start")))
 
 
 def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
@@ -61,8 +67,8 @@ def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
 
 def plausible(estimate: Estimate, start: Tensor, past: Past, radius: Tensor) -> Tensor:
     """Places (R,) that were tracked to, look familiar, and lie about as close to the ``start`` (R, 3) as that does to
-    the last pose."""
-    near = ~strayed(estimate, start, past, radius, BASIN)
+    the last pose, if that has been tracked to as well: else nobody knows where it was going."""
+    near = ~strayed(estimate, start, past, radius, BASIN) & (past.found == 0)
     return Status.good(estimate.status) & (estimate.score >= FAMILIAR * past.usual) & near
 
 
@@ -198,9 +204,7 @@ class Recovery:
         found, _ = locator.candidates(views, 0, pose, allowed=self.allowed(past, index))
         found = found.at(~self.max_step.exceeded(found.pose, pose, past.since[r]))
         best = found.at(index.new_zeros(1)) if len(found.pose) else estimate.at(index)
-        a, b = ANYWHERE_MARGIN
-        known = (best.status == Status.CONVERGED) & (1 - best.score <= a * (1 - past.usual[index]) + b)
-        if not (known & beats(best, estimate.at(index))):
+        if not (familiar(best, past.usual[index]) & beats(best, estimate.at(index))):
             return estimate
         radius = self.reference.place.radius[r]
         distance = pose_distance(best.pose[0], pose, radius=radius)

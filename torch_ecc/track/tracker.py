@@ -24,14 +24,14 @@ from torch_ecc.core.sight import as_frame_mask, filled, seen_through
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
+from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, coast
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
-KEPT = 16  # frames for which a template that is not found is expected to go on as before
-MEMORY = 0.05  # weight of the newest frame in the usual score
+DERIVED = ("references", "_recovery", "_crowd")
 
 
 class SequenceError(ValueError):
@@ -78,6 +78,7 @@ class Tracker(nn.Module):
     velocity: Tensor
     score: Tensor
     since: Tensor
+    found: Tensor
     suspect_frames: Tensor
     turn: Tensor
 
@@ -116,16 +117,9 @@ class Tracker(nn.Module):
         patches = unmarked("Tracker", locate_patches("Tracker", gray, centers, size, mask), self.frame_mask)
         _check_levels(levels, patches.size)
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
-        none = torch.zeros_like(start[:, 0], dtype=torch.int64)
-        for name, value in templates._asdict().items():
+        first = _kept(filled(gray, self.frame_mask))  # frame: what else in it looks like them?
+        for name, value in {**templates._asdict(), "first": first, **beginning(start)}.items():
             self.register_buffer(name, value)
-        self.register_buffer("first", _kept(filled(gray, self.frame_mask)))  # frame: what else in it looks like them?
-        self.register_buffer("start", start)  # of every template, all (R, 3), px, px, rad
-        self.register_buffer("pose", start.clone())  # the last good one
-        self.register_buffer("velocity", torch.zeros_like(start))  # what the frames since will have added to it
-        self.register_buffer("since", none + 1)  # frames from then to the next one
-        self.register_buffer("suspect_frames", none)  # frames in a row
-        self.register_buffer("turn", none[0].clone())  # (): which of many lost ones is searched for next
         self._use(self._prepared(*templates))
         self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
         _warn_of_textureless(self._recovery.textureless)
@@ -190,7 +184,7 @@ class Tracker(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Of copies and pickles: without what follows from the templates."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("references", "_recovery", "_crowd")}
+        return {name: value for name, value in self.__dict__.items() if name not in DERIVED}
 
     @lasting
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -251,14 +245,14 @@ class Tracker(nn.Module):
         estimate = self._within_reach(self._solve(images, start))
         doubtful = any(suspect(estimate, state["score"]))
         if doubtful and self.search:
-            past = Past(*(state[name] for name in ("pose", "since", "score", "suspect_frames", "first", "start")))
+            past = Past.of(state)
             estimate = self._within_reach(self._recovery(images, estimate, start, past))
             suspects = suspect(estimate, state["score"])
             estimate = disbelieved(estimate, suspects, start, past, self.references[0].place.radius)
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
         if not doubtful and apart is estimate:
-            return self._advance(estimate)
-        return self._advance_doubtful(apart, suspect(apart, state["score"]))
+            return advanced(state, estimate)
+        return advanced_in_doubt(state, apart, suspect(apart, state["score"]))
 
     def _within_reach(self, estimate: Estimate) -> Estimate:
         """The ``estimate`` in which those are lost that are farther from their last pose than ``max_step`` allows."""
@@ -276,7 +270,7 @@ class Tracker(nn.Module):
     def skip(self) -> Estimate:
         """The record (R, ...) of a frame that cannot be looked at: the last good poses, and Status.DAMAGED."""
         state: Any = self._buffers
-        self._coast(torch.zeros_like(state["since"], dtype=torch.bool))
+        coast(state, torch.zeros_like(state["since"], dtype=torch.bool))
         pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
         codes = (Status.DAMAGED, Origin.TRACKED, Reason.DAMAGED)
         status, origin, reason = (none.to(torch.int8) + int(code) for code in codes)
@@ -323,43 +317,6 @@ class Tracker(nn.Module):
             pose = torch.where(better[:, None], state.pose * scale, pose)
         start, usual = self._buffers["start"], self._buffers["score"]
         return solve(self.references[0], images[0], pose, self.settings, start, usual)
-
-    def _advance(self, estimate: Estimate) -> Estimate:
-        """One frame on, in which nothing is suspect: the next state, and the ``estimate``."""
-        state: Any = self._buffers
-        last, since = state["pose"], state["since"]
-        step = (estimate.pose - last).div_(since.unsqueeze(1))
-        state["score"].lerp_(estimate.score, MEMORY)
-        since.fill_(1)
-        state["suspect_frames"].zero_()
-        state["velocity"].copy_(step)
-        last.copy_(estimate.pose)
-        return estimate
-
-    def _advance_doubtful(self, estimate: Estimate, suspects: list[bool]) -> Estimate:
-        """The same where some are suspect or were, with the last good pose of what was not found. What a search has
-        found is no step: it tells nothing of the velocity."""
-        state: Any = self._buffers
-        last, usual, velocity = state["pose"], state["score"], state["velocity"]
-        good = Status.good(estimate.status)
-        pose = torch.where(good[:, None], estimate.pose, last)
-        usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
-        step = (pose - last) / state["since"].unsqueeze(1)
-        step = torch.where((estimate.origin == Origin.TRACKED)[:, None], step, 0.0)
-        velocity.copy_(torch.where(good[:, None], step, velocity))
-        self._coast(good)
-        state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
-        last.copy_(pose)
-        return estimate._replace(pose=pose, displacement=pose - state["start"])
-
-    def _coast(self, good: Tensor) -> None:
-        """One frame on, in which those were found that are ``good`` (R,): the others are expected to go on as they
-        went for a while, and then where they were last."""
-        state: Any = self._buffers
-        since = state["since"]
-        longer = torch.where(since < KEPT, (since + 1) / since, 0.0)
-        state["velocity"].mul_(torch.where(good, 1.0, longer).unsqueeze(1))
-        since.add_(1).masked_fill_(good, 1)
 
 
 def _kept(frame: Tensor) -> Tensor:
