@@ -29,7 +29,7 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.io import open_frames
 from torch_ecc.sim import Camera, Pads, Scene, Speckle
 from torch_ecc.sim.camera.still import image_scene
-from torch_ecc.track.recover import Recovery
+from torch_ecc.track.recover import Past, Recovery
 from torch_ecc.track.tracker import PREDICTIONS
 
 MIDDLE = torch.tensor([320.0, 240.0, 0.0], dtype=torch.float64)
@@ -41,7 +41,7 @@ console = Console(width=170)
 class Nowhere(Recovery):
     """Looks at nothing near."""
 
-    def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor, due: list[int]) -> Estimate:
+    def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, past: Past, due: list[int]) -> Estimate:
         return estimate
 
 
@@ -50,7 +50,7 @@ class WholeFrame(Tracker):
 
     def _use(self, references: list[Reference]) -> None:
         super()._use(references)
-        self._recovery = Nowhere(references[0], self.settings, self.turn)
+        self._recovery = Nowhere(references[0], self.settings, self.turn, self.max_step)
 
 
 def jump(scene: Scene, spread: tuple[float, float], seed: int, length: float, turn: float) -> Tensor:

@@ -15,6 +15,7 @@ from torch_ecc import Origin, Status, Tracker
 from torch_ecc.core.pose import compose
 from torch_ecc.io import open_frames
 from torch_ecc.sim.scene.scene import PlaneWaves
+from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.recover import Recovery, common_motion, gone_together
 
 FRAME = (240, 320)
@@ -230,3 +231,84 @@ def test_where_many_jump_the_others_are_found_by_the_motion_of_some(data, last):
     assert (estimate.status == Status.CONVERGED).all()
     assert (estimate.origin != Origin.TRACKED).all()
     assert (estimate.displacement[:, :2] - torch.tensor([truth["tx"], truth["ty"]])).abs().max() < 0.05
+
+
+def test_two_equal_parts_that_cross_are_told_apart_or_lost():
+    """Each is followed; one passes over the other. Nothing is wrong and believed, and both are right again after."""
+    part = SCENE.render(torch.tensor([[30.0, 30.0, 0.0]]).double(), (61, 61))[0, 0]
+    for beside, speed in ((8, 5), (3, 4), (14, 6)):
+        shots = []
+        for k in range(31):
+            image = torch.full(FRAME, 90.0)
+            for x, y in ((60 + speed * k, 100), (60 + 30 * speed - speed * k, 100 + beside)):
+                image[y - 30 : y + 31, x - 30 : x + 31] = part
+            shots.append(noisy(image.numpy(), np.random.default_rng(k)))
+        tracker = Tracker(shots[0], [(60.0, 100.0), (60.0 + 30 * speed, 100.0 + beside)], 61)
+        track = tracker.track_sequence(shots[1:])
+        way = speed * torch.arange(1.0, 31)
+        truth = torch.stack((way, -way), 1)
+        off = (track.displacement[:, :, 0] - truth).abs() + track.displacement[:, :, 1].abs()
+        assert (off[track.status == Status.CONVERGED] < 0.3).all()
+        assert (track.status[-1] == Status.CONVERGED).all()
+
+
+def test_two_templates_on_one_place_of_which_none_is_expected_there_are_lost():
+    image = still((0, 0, 0), (0, 0, 0))
+    tracker = Tracker(image[0], [(150.0, 120.0), (170.0, 120.0)], 61)
+    estimate = tracker(image[1])
+    there = estimate._replace(pose=estimate.pose[:1].expand(2, 3) + torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
+    crowd = Crowd(tracker.start[:, :2])
+    assert crowd.apart(estimate, estimate.pose) is estimate
+    for off, status in ((9.0, Status.LOST), (0.2, Status.CONVERGED)):
+        start = there.pose + torch.tensor([[off, 0.0, 0.0], [9.0, 0.0, 0.0]])
+        told = crowd.apart(there, start)
+        assert told.status.tolist() == [status, Status.LOST]
+        assert told.reason[1] == te.Reason.SHARED
+        assert told.covariance[1].diagonal().isinf().all()
+    found = there._replace(origin=torch.tensor([Origin.NEARBY, Origin.TRACKED]).to(torch.int8))
+    assert crowd.apart(found, start).status.tolist() == [Status.LOST, Status.CONVERGED]
+
+
+def test_what_moves_on_while_it_is_hidden_is_expected_where_it_has_gone():
+    """By 5 px per frame, hidden for six of them: it is tracked on without a search."""
+    stack = still(*((5 * k, 2 * k, 0) for k in range(13)), start=(110.0, 100.0, 0.0))
+    tracker = Tracker(stack[0], [(110.0, 100.0)], 61, search=False)
+    for k in range(1, 13):
+        hidden = 4 <= k < 10
+        estimate = tracker(torch.full_like(stack[0], 90) if hidden else stack[k])
+        assert (estimate.status == Status.LOST) == hidden
+    assert (estimate.displacement[0] - torch.tensor([60.0, 24.0, 0.0])).abs().max() < 0.05
+
+
+@pytest.mark.parametrize("step", [(20.0, 30.0), (60.0, 6.0)])
+def test_nothing_is_believed_beyond_the_largest_step(step):
+    """A jump of 40 px and 12 deg; four frames later that is no jump any more, and it is found."""
+    stack = still((0, 0, 0), (40, 0, 12))
+    tracker, free = (Tracker(stack[0], [(160.0, 120.0)], 61, max_step=most) for most in (step, None))
+    assert free(stack[1]).status == Status.CONVERGED
+    assert tracker(stack[1]).status == Status.LOST
+    for _ in range(3):
+        estimate = tracker(stack[1])
+    assert estimate.status == Status.CONVERGED
+    assert (estimate.pose - free.pose).abs().max() < 1e-3
+
+
+def test_the_largest_step_tells_equal_parts_apart():
+    """Pads 60 px apart; one that has been hidden has gone by half that, which may be any of them, or not."""
+    u, v = (X - 160) % 60 - 30, (Y - 120) % 60 - 30
+    pads = 70 + 100 * edge(14 - abs(30 - abs(u))) * edge(10 - abs(30 - abs(v)))
+    moved = np.roll(pads, 26, 1)
+    rng = np.random.default_rng(0)
+    first, hidden, last = (noisy(image, rng) for image in (pads, np.full(FRAME, 90.0), moved))
+    for most, status in ((None, Status.LOST), ((15.0, 2.0), Status.CONVERGED)):
+        tracker = Tracker(first, [(160.0, 120.0)], 61, max_step=most)
+        tracker(hidden)
+        estimate = tracker(last)
+        assert estimate.status == status, most
+    assert (estimate.displacement[0, :2] - torch.tensor([26.0, 0.0])).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("step", [5.0, (5.0,), (0.0, 1.0), (5.0, float("nan")), ("a", 1.0), (-1.0, 2.0), "ab"])
+def test_a_largest_step_is_two_numbers(step):
+    with pytest.raises(ValueError, match=r"max_step: expected \(px, deg\) per frame, both > 0, got"):
+        Tracker(still((0, 0, 0))[0], [(160.0, 120.0)], 61, max_step=step)

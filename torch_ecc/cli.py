@@ -78,6 +78,7 @@ def demo(out: str, frames: int) -> None:
     centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
     size={"type": str, "metavar": "N|H,W", "callback": read_size},
     um_per_px={"type": str, "metavar": "S|SX,SY", "callback": read_scale},
+    max_step={"nargs": 2, "type": float, "metavar": "PX DEG"},
     polygons={
         "flag": "--polygon",
         "type": str,

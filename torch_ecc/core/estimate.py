@@ -46,7 +46,8 @@ class Origin(IntEnum):
 
 class Reason(IntEnum):
     """Why a pose is not to be trusted: NONE if, and only if, the status is CONVERGED. Every other one goes with one
-    status: MOVING with MAX_ITERATIONS, UNSURE and NOISE with LOW_TEXTURE, those from COVERED to AMBIGUOUS with LOST."""
+    status: MOVING with MAX_ITERATIONS, UNSURE and NOISE with LOW_TEXTURE, those from COVERED to AMBIGUOUS and from
+    TOO_FAR on with LOST."""
 
     NONE = 0
     MOVING = 1
@@ -60,6 +61,9 @@ class Reason(IntEnum):
     UNSURE = 9
     NOISE = 10
     DAMAGED = 11
+    TOO_FAR = 12
+    SHARED = 13
+    WAITING = 14
 
     @property
     def word(self) -> str:
@@ -93,6 +97,9 @@ _REASONS = {
     Reason.UNSURE: "Sigma is too large: too little texture is seen for the noise.",
     Reason.NOISE: "In some direction nothing but the template's own noise fixes x, y or theta.",
     Reason.DAMAGED: "The frame is damaged, or not like the first one.",
+    Reason.TOO_FAR: "It was found farther from its last place than the largest step that was stated.",
+    Reason.SHARED: "Another template of the tracker has come to the same place, and looks the same.",
+    Reason.WAITING: "It is lost, and its turn to be searched for has not come yet.",
 }
 
 

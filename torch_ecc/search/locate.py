@@ -30,6 +30,7 @@ from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import within_margin
 from torch_ecc.search.bank import Bank, search_level
 from torch_ecc.search.matched_filter import whitened_matches
+from torch_ecc.search.nearby import Allowed
 
 MAX_LEVELS = 8  # of a pyramid: it ends where the template gets too small
 SMALLEST_FRAME = 12  # px: a frame is not downsampled below this side
@@ -139,17 +140,24 @@ class Locator:
         return _best_two([self.candidates(images, b, places[b], matched_filter=True) for b in range(count)])
 
     def candidates(
-        self, images: list[Tensor], b: int, near: Tensor | None = None, *, matched_filter: bool = False
+        self,
+        images: list[Tensor],
+        b: int,
+        near: Tensor | None = None,
+        *,
+        matched_filter: bool = False,
+        allowed: Allowed | None = None,
     ) -> tuple[Estimate, Tensor]:
         """Template ``b`` in the levels ``images`` (1 or B, 1, h, w) of a frame: a few distinct poses (K, ...) and their
-        scores (K,), the best first; of those as good the nearest to ``near`` (2,) or (3,) first.
+        scores (K,), the best first; of those as good the nearest to ``near`` (2,) or (3,) first. Poses that are not
+        ``allowed`` are looked at only where there are no others.
 
         ``matched_filter``: when they are ambiguous, or none was near the best, those of its places come in as well.
         """
         images = [image if len(image) == 1 else image[b : b + 1] for image in images]
         reference = self.pyramids[b][0]
         radius = reference.place.radius
-        pose = self.coarse(images, b)
+        pose = self.coarse(images, b, allowed=allowed)
         finalists, others = pose[:FINALISTS], pose[FINALISTS:]
         if near is not None and len(others):
             nearest = pose_distance(others, near, radius=radius).argmin()
@@ -178,12 +186,16 @@ class Locator:
         estimate = estimate._replace(origin=torch.full_like(estimate.origin, int(Origin.ANYWHERE)))
         return estimate, detrended_zncc_at(copies, image, estimate.pose)
 
-    def coarse(self, images: list[Tensor], b: int, near: Tensor | None = None) -> Tensor:
+    def coarse(
+        self, images: list[Tensor], b: int, near: Tensor | None = None, allowed: Allowed | None = None
+    ) -> Tensor:
         """Poses (K, 3) of template ``b`` in one frame before they are refined at its full resolution, best first; of
         many only the SURVIVORS nearest to ``near`` (3,), if that is given."""
         references, bank = self.pyramids[b], self.banks[b]
         top = len(references) - 1
         pose, score = bank.candidates(images[top][0, 0], CANDIDATES)
+        if allowed is not None:
+            score = torch.where(allowed(pose * pose.new_tensor((2.0**top, 2.0**top, 1.0)))[0], score, -1.0)
         pose = pose[shortlist(pose, score, radius=references[top].place.radius, margin=GRID_MARGIN)]
         if near is not None:
             place = near / near.new_tensor((2.0**top, 2.0**top, 1.0))

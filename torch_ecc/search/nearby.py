@@ -7,6 +7,7 @@ What brings a template back that is out of Gauss-Newton's reach, for a tenth of 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -31,6 +32,8 @@ LARGEST_KERNEL = 49  # pixels across: they tell enough
 CANDIDATES = 3  # places per template that are brought to the answer: those with
 SCORE_MARGIN = 0.25  # s >= s_best - this, the nearest first
 FARTHER_MARGIN = (0.9, 0.002)  # (a, b): a farther place of score s is better if 1 - s < a (1 - s_nearer) - b
+
+Allowed = Callable[[Tensor], Tensor]  # which of places (..., 3) may be the template's, bool (...)
 
 
 class Nearby(NamedTuple):
@@ -64,10 +67,14 @@ class Nearby(NamedTuple):
         correlator = _correlator(texture, weights, shape)
         return Nearby(spacing, shape, middle.to(template.radius), template.radius, correlator)
 
-    def find(self, reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
+    def find(
+        self, reference: Reference, image: Tensor, pose: Tensor, settings: Settings, allowed: Allowed | None = None
+    ) -> Estimate:
         """The templates in ``image`` (1 or B, 1, H, W) around ``pose`` (B, 3): the nearest of those places that are not
-        clearly worse than another."""
+        clearly worse than another, of those that are ``allowed``."""
         place, score = self.candidates(image, pose)
+        if allowed is not None:
+            score = torch.where(allowed(place), score, -1.0)
         step = place - pose[:, None]
         distance = torch.cat((step[..., :2], step[..., 2:] * self.radius[:, None, None]), -1).norm(dim=-1)
         distance = torch.where(score >= score.amax(-1, keepdim=True) - SCORE_MARGIN, distance, torch.inf)

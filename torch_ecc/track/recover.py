@@ -7,6 +7,7 @@ gone together, that is where the others are looked for.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -23,30 +24,39 @@ from torch_ecc.core.sight import filled
 from torch_ecc.core.verdict import expected_score, just_as_good, noise_share, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
-from torch_ecc.search.nearby import Nearby
+from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
+from torch_ecc.track.max_step import MaxStep
 
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
-ANYWHERE_MARGIN = (2.0, 0.02)  # (a, b): a place of score s may be the template's if 1 - s <= a (1 - s_usual) + b
 AT_ONCE = 8  # templates searched for in the whole of one frame; the others in turn
 NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
 SELDOM = 16  # frames between two searches for what has been lost for long
 NOISE_ALONE = 1.3  # times as much noise in some direction as there may be: no place can be told from the next one
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
+COARSE = (8.0, ANGLE_STEP)  # px, rad: as finely as places are told apart before they are refined
 SLID = 16.0  # px beyond the last step: where something else was tracked, if it does not look as usual either
 FEWEST_TOGETHER = 3  # templates that must have gone the same way for others to be looked for there
 TOGETHER = 3.0  # px: they have gone the same way, and more than half of those that were found have
 
 
 class Past(NamedTuple):
-    """What is known of R templates before a frame: last good ``pose`` (R, 3), ``usual`` score (R,), ``suspect_frames``
-    (R,) in a row, and the ``first`` frame (1 or R, 1, H, W), where they were at ``home`` (R, 3)."""
+    """What is known of R templates before a frame: last good ``pose`` (R, 3), ``since`` (R,) how many frames, if a
+    search has ``found`` it (R,) 0 or 1, ``usual`` score (R,), ``suspect_frames`` (R,) in a row, and the ``first`` frame
+    (1 or R, 1, H, W), where they were at ``home`` (R, 3)."""
 
     pose: Tensor
+    since: Tensor
+    found: Tensor
     usual: Tensor
     suspect_frames: Tensor
     first: Tensor
     home: Tensor
+
+    @staticmethod
+    def of(state: Mapping[str, Tensor]) -> Past:
+        """From a tracker's buffers."""
+        return Past(*(state[name] for name in ("pose", "since", "found", "score", "suspect_frames", "first", "start")))
 
 
 def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
@@ -57,8 +67,8 @@ def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
 
 def plausible(estimate: Estimate, start: Tensor, past: Past, radius: Tensor) -> Tensor:
     """Places (R,) that were tracked to, look familiar, and lie about as close to the ``start`` (R, 3) as that does to
-    the last pose."""
-    near = ~strayed(estimate, start, past, radius, BASIN)
+    the last pose, if that has been tracked to as well: else nobody knows where it was going."""
+    near = ~strayed(estimate, start, past, radius, BASIN) & (past.found == 0)
     return Status.good(estimate.status) & (estimate.score >= FAMILIAR * past.usual) & near
 
 
@@ -73,9 +83,14 @@ def disbelieved(estimate: Estimate, suspects: list[bool], start: Tensor, past: P
     lost."""
     slid = (estimate.origin == Origin.TRACKED) & strayed(estimate, start, past, radius, SLID)
     lost = torch.tensor(suspects, device=start.device) & slid & Status.good(estimate.status)
+    return disproved(estimate, lost, Reason.ELSEWHERE)
+
+
+def disproved(estimate: Estimate, lost: Tensor, reason: Reason) -> Estimate:
+    """The ``estimate`` in which those (R,) that are ``lost`` are so for a ``reason``."""
     return estimate._replace(
         status=torch.where(lost, int(Status.LOST), estimate.status).to(torch.int8),
-        reason=torch.where(lost, int(Reason.ELSEWHERE), estimate.reason).to(torch.int8),
+        reason=torch.where(lost, int(reason), estimate.reason).to(torch.int8),
         covariance=torch.where(lost[:, None, None], unknown(estimate.covariance), estimate.covariance),
     )
 
@@ -109,9 +124,9 @@ class Recovery:
     """The searches of one tracker, and what is prepared for them."""
 
     @lasting
-    def __init__(self, reference: Reference, settings: Settings, turn: Tensor) -> None:
+    def __init__(self, reference: Reference, settings: Settings, turn: Tensor, max_step: MaxStep) -> None:
         # A wrong place must not be made right by leaving out what does not fit.
-        self.reference, self.settings = reference, replace(settings, robust=False)
+        self.reference, self.settings, self.max_step = reference, replace(settings, robust=False), max_step
         self.turn = turn  # whose turn it is if they are many, (): the tracker's, written in place
         self.expected = expected_score(reference)
         self.textureless, self.hopeless = textureless(reference, settings)
@@ -128,11 +143,11 @@ class Recovery:
         if not due:
             return estimate
         images[:] = self.unmarked(images)
-        found = self.search_near(images[0], estimate, start, past.usual, sorted(due))
+        found = self.search_near(images[0], estimate, start, past, sorted(due))
         estimate = self.follow(images[0], self.own(found, estimate, start, past), start, past.usual)
         suspects = suspect(estimate, past.usual)
         kept = plausible(estimate, start, past, self.reference.place.radius).tolist()
-        gone = [r for r in due if suspects[r] and not kept[r]][:AT_ONCE]
+        gone = [r for r in due if suspects[r] and not kept[r] and not self.searched_all(past.since[r])][:AT_ONCE]
         for r in gone:
             estimate = self.search_anywhere(images, estimate, past, r)
         return self.follow(images[0], estimate, start, past.usual) if gone else estimate
@@ -157,32 +172,45 @@ class Recovery:
             due = due[turn:] + due[:turn]
         return due[:NEARBY_AT_ONCE]
 
-    def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor, due: list[int]) -> Estimate:
+    def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, past: Past, due: list[int]) -> Estimate:
         """Second attempt for the templates ``due``: around their ``start`` (R, 3)."""
         index = torch.tensor(due, device=start.device)
         view = image if len(image) == 1 else image[index]
-        found = self.surroundings(due).find(self.reference.select(index), view, start[index], self.settings)
-        known = familiar(found, usual[index]) & beats(found, estimate.at(index))
+        found = self.surroundings(due).find(
+            self.reference.select(index), view, start[index], self.settings, self.allowed(past, index)
+        )
+        known = familiar(found, past.usual[index]) & beats(found, estimate.at(index))
+        known &= ~self.max_step.exceeded(found.pose, past.pose[index], past.since[index])
         return estimate.put(index[known], found.at(known))
+
+    def allowed(self, past: Past, index: Tensor) -> Allowed | None:
+        """Which poses (n, K, 3) of templates at ``index`` (n,) are near enough to their last ones; None if all are."""
+        if not self.max_step.known:
+            return None
+        last, since = past.pose[index, None], past.since[index, None]
+        return lambda pose: ~self.max_step.exceeded(pose, last, since, COARSE)
+
+    def searched_all(self, since: Tensor) -> bool:
+        """Whether a search near has looked wherever a template can have come to in ``since`` () frames."""
+        length, angle = self.max_step
+        return bool((2 * length * since <= HALF_WIDTH) & (2 * angle * since <= LARGEST_ANGLE))
 
     def search_anywhere(self, images: list[Tensor], estimate: Estimate, past: Past, r: int) -> Estimate:
         """Third attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
         locator, pose = self.locator(r, (images[0].shape[-2], images[0].shape[-1])), past.pose[r]
         images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
-        found, _ = locator.candidates(views, 0, pose)
-        if found.status[0] != Status.CONVERGED:
-            return estimate
         index = torch.tensor([r], device=pose.device)
-        best = found.at(index.new_zeros(1))
-        a, b = ANYWHERE_MARGIN
-        known = 1 - best.score <= a * (1 - past.usual[index]) + b
-        if not (known & beats(best, estimate.at(index))):
+        found, _ = locator.candidates(views, 0, pose, allowed=self.allowed(past, index))
+        found = found.at(~self.max_step.exceeded(found.pose, pose, past.since[r]))
+        best = found.at(index.new_zeros(1)) if len(found.pose) else estimate.at(index)
+        if not (familiar(best, past.usual[index]) & beats(best, estimate.at(index))):
             return estimate
         radius = self.reference.place.radius[r]
         distance = pose_distance(best.pose[0], pose, radius=radius)
         others = LookAlikes.around(found, best.pose[0], radius).nearest(best.score[0], torch.ones_like(radius))
-        if distance > NEARER * torch.minimum(others, self.twin(r, best.score[0], past, locator)):
+        twin = torch.minimum(others, self.twin(r, best.score[0], past, locator))
+        if self.confusable(distance, twin, distance + self.max_step.reach(past.since[r], radius)):
             return ambiguous(estimate, index)
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
@@ -198,9 +226,17 @@ class Recovery:
             self.near |= zip(unseen, self._look_near(unseen, past), strict=True)
         raised = self.raised(found.score, past.usual)
         twin = torch.stack([self.near[r].nearest(found.score[r], raised[r]) for r in leapt.tolist()])
-        distance = pose_distance(found.pose[leapt], start[leapt], radius=self.reference.place.radius[leapt])
-        doubtful = leapt[distance > NEARER * twin]
+        radius = self.reference.place.radius[leapt]
+        distance, moved = (pose_distance(found.pose[leapt], p[leapt], radius=radius) for p in (start, past.pose))
+        farthest = moved + self.max_step.reach(past.since[leapt], radius)
+        doubtful = leapt[self.confusable(distance, twin, farthest)]
         return ambiguous(found.put(doubtful, before.at(doubtful)), doubtful)
+
+    @staticmethod
+    def confusable(distance: Tensor, twin: Tensor, farthest: Tensor) -> Tensor:
+        """Whether (...) a place at a ``distance`` (...) from where a template is expected may be that of its ``twin``
+        (...) px away, if that is no farther than the ``farthest`` (...) that can have come there."""
+        return (distance > NEARER * twin) & (twin <= farthest)
 
     def raised(self, score: Tensor, usual: Tensor) -> Tensor:
         """By what factor (R,) scores are higher than they were in the first frame, as far as the ``usual`` one (R,)

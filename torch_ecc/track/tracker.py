@@ -24,11 +24,14 @@ from torch_ecc.core.sight import as_frame_mask, filled, seen_through
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
-from torch_ecc.track.recover import Past, Recovery, disbelieved, suspect
+from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, coast
+from torch_ecc.track.crowd import Crowd
+from torch_ecc.track.max_step import MaxStep
+from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
-MEMORY = 0.05  # weight of the newest frame in the usual score
+DERIVED = ("references", "_recovery", "_crowd")
 
 
 class SequenceError(ValueError):
@@ -54,7 +57,9 @@ class Tracker(nn.Module):
     it is out of view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
     (``core.robust``); ``search``: look for a template that is lost, or looks less like itself than usual, near where it
     is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
-    more seldom the longer it stays so (every 16th frame in the end); ``backend``: "auto", "torch" or "native", see
+    more seldom the longer it stays so (every 16th frame in the end); ``max_step``: (px, deg), how far a template's
+    centre moves, and how far it turns, from one frame to the next at most: nothing farther is believed, nor looked at;
+    ``backend``: "auto", "torch" or "native", see
     settings.Settings.
 
     What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
@@ -72,7 +77,8 @@ class Tracker(nn.Module):
     pose: Tensor
     velocity: Tensor
     score: Tensor
-    tracked: Tensor
+    since: Tensor
+    found: Tensor
     suspect_frames: Tensor
     turn: Tensor
 
@@ -97,28 +103,23 @@ class Tracker(nn.Module):
         min_visible: float = 0.25,
         robust: bool = True,
         search: bool = True,
+        max_step: tuple[float, float] | None = None,
         backend: str = "auto",
     ) -> None:
         super().__init__()
         _check_prediction(prediction)
         self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, robust, backend)
         self.prediction, self.search, self.criterion = prediction, search, make_criterion(criterion, illumination)
+        self.max_step = MaxStep.of(max_step)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape, self.levels = tuple(gray.shape), levels
         self.frame_mask = _frame_mask("Tracker", frame_mask, gray)
         patches = unmarked("Tracker", locate_patches("Tracker", gray, centers, size, mask), self.frame_mask)
         _check_levels(levels, patches.size)
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
-        none = torch.zeros_like(start[:, 0], dtype=torch.int64)
-        for name, value in templates._asdict().items():
+        first = _kept(filled(gray, self.frame_mask))  # frame: what else in it looks like them?
+        for name, value in {**templates._asdict(), "first": first, **beginning(start)}.items():
             self.register_buffer(name, value)
-        self.register_buffer("first", _kept(filled(gray, self.frame_mask)))  # frame: what else in it looks like them?
-        self.register_buffer("start", start)  # of every template, all (R, 3), px, px, rad
-        self.register_buffer("pose", start.clone())  # the last good one
-        self.register_buffer("velocity", torch.zeros_like(start))  # what the last step has added to it
-        self.register_buffer("tracked", (none + 1).to(torch.int8))  # in the last frame, 0 or 1: averages of bool fail
-        self.register_buffer("suspect_frames", none)  # frames in a row
-        self.register_buffer("turn", none[0].clone())  # (): which of many lost ones is searched for next
         self._use(self._prepared(*templates))
         self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
         _warn_of_textureless(self._recovery.textureless)
@@ -139,11 +140,10 @@ class Tracker(nn.Module):
         h, w = gray.shape[-2:]
         tracker = cls(gray, [((w - 1) / 2, (h - 1) / 2)] * len(gray), (h, w), **options)
         view = as_gray("find", "frame", frame, tracker.pose.device)
-        tracker.frame_mask = _frame_mask("find", frame_mask, view)
+        tracker.frame_mask, tracker.frame_shape = _frame_mask("find", frame_mask, view), tuple(view.shape)
         tracker._use(tracker.references)
         settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
-        tracker.frame_shape = tuple(view.shape)
         tracker.register_buffer("first", _kept(filled(view, tracker.frame_mask)))
         tracker.start.copy_(located.pose)
         tracker.pose.copy_(located.pose)
@@ -159,7 +159,9 @@ class Tracker(nn.Module):
     def _use(self, references: list[Reference]) -> None:
         """Goes on with ``references``, in what the camera shows."""
         self.references = [seen_through(references[0], self.frame_mask), *references[1:]]
-        self._recovery = Recovery(self.references[0], self.settings, self.turn)
+        self._recovery = Recovery(self.references[0], self.settings, self.turn, self.max_step)
+        alone = len(self.start) == 1 or self.frame_shape[0] > 1
+        self._crowd = None if alone else Crowd(self.start[:, :2])
 
     def __setattr__(self, name: str, value: Any) -> None:
         """What is assigned to a part of the state, ``tracker.pose = pose``, is written into it."""
@@ -182,7 +184,7 @@ class Tracker(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Of copies and pickles: without what follows from the templates."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("references", "_recovery")}
+        return {name: value for name, value in self.__dict__.items() if name not in DERIVED}
 
     @lasting
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -240,16 +242,25 @@ class Tracker(nn.Module):
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image]
-        estimate = self._solve(images, start)
-        suspects = suspect(estimate, state["score"])
-        if not any(suspects):
-            return self._advance(estimate)
-        if self.search:
-            past = Past(*(state[name] for name in ("pose", "score", "suspect_frames", "first", "start")))
-            estimate = self._recovery(images, estimate, start, past)
+        estimate = self._within_reach(self._solve(images, start))
+        doubtful = any(suspect(estimate, state["score"]))
+        if doubtful and self.search:
+            past = Past.of(state)
+            estimate = self._within_reach(self._recovery(images, estimate, start, past))
             suspects = suspect(estimate, state["score"])
             estimate = disbelieved(estimate, suspects, start, past, self.references[0].place.radius)
-        return self._advance_doubtful(estimate, suspects)
+        apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
+        if not doubtful and apart is estimate:
+            return advanced(state, estimate)
+        return advanced_in_doubt(state, apart, suspect(apart, state["score"]))
+
+    def _within_reach(self, estimate: Estimate) -> Estimate:
+        """The ``estimate`` in which those are lost that are farther from their last pose than ``max_step`` allows."""
+        if not self.max_step.known:
+            return estimate
+        state: Any = self._buffers
+        beyond = self.max_step.exceeded(estimate.pose, state["pose"], state["since"])
+        return disproved(estimate, beyond & Status.good(estimate.status), Reason.TOO_FAR)
 
     def track(self, frame: Tensor) -> Estimate:
         """Same as calling the tracker."""
@@ -259,7 +270,7 @@ class Tracker(nn.Module):
     def skip(self) -> Estimate:
         """The record (R, ...) of a frame that cannot be looked at: the last good poses, and Status.DAMAGED."""
         state: Any = self._buffers
-        state["tracked"].zero_()  # what comes next has made more than one step
+        coast(state, torch.zeros_like(state["since"], dtype=torch.bool))
         pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
         codes = (Status.DAMAGED, Origin.TRACKED, Reason.DAMAGED)
         status, origin, reason = (none.to(torch.int8) + int(code) for code in codes)
@@ -306,33 +317,6 @@ class Tracker(nn.Module):
             pose = torch.where(better[:, None], state.pose * scale, pose)
         start, usual = self._buffers["start"], self._buffers["score"]
         return solve(self.references[0], images[0], pose, self.settings, start, usual)
-
-    def _advance(self, estimate: Estimate) -> Estimate:
-        """One frame on, in which nothing is suspect: the next state, and the ``estimate``."""
-        state: Any = self._buffers
-        last, tracked = state["pose"], state["tracked"]
-        step = (estimate.pose - last).mul_(tracked.unsqueeze(1))
-        state["score"].lerp_(estimate.score, MEMORY)
-        tracked.fill_(1)
-        state["suspect_frames"].zero_()
-        state["velocity"].copy_(step)
-        last.copy_(estimate.pose)
-        return estimate
-
-    def _advance_doubtful(self, estimate: Estimate, suspects: list[bool]) -> Estimate:
-        """The same where some are suspect or were, with the last good pose of what was not found. What a search has
-        found is no step: it tells nothing of the velocity."""
-        state: Any = self._buffers
-        last, usual, tracked = state["pose"], state["score"], state["tracked"]
-        good = Status.good(estimate.status)
-        pose = torch.where(good[:, None], estimate.pose, last)
-        usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
-        stepped = good & (estimate.origin == Origin.TRACKED) & (tracked > 0)
-        state["velocity"].copy_(torch.where(stepped[:, None], pose - last, 0.0))
-        tracked.copy_(good)
-        state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
-        last.copy_(pose)
-        return estimate._replace(pose=pose, displacement=pose - state["start"])
 
 
 def _kept(frame: Tensor) -> Tensor:

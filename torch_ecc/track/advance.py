@@ -1,0 +1,69 @@
+"""What a tracker knows from one frame to the next: the parts of its state that every frame changes, in place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.estimate import Estimate, Origin, Status
+
+MEMORY = 0.05  # weight of the newest frame in the usual score
+KEPT = 16  # frames for which a template that is not found is expected to go on as before
+
+State = Mapping[str, Tensor]  # a tracker's buffers: see there
+
+
+def beginning(start: Tensor) -> dict[str, Tensor]:
+    """What is known of templates that are at ``start`` (R, 3), but for their looks."""
+    none = torch.zeros_like(start[:, 0], dtype=torch.int64)
+    return {
+        "start": start,  # all (R, 3), px, px, rad
+        "pose": start.clone(),  # the last good one
+        "velocity": torch.zeros_like(start),  # what the frames since will have added to it
+        "since": none + 1,  # frames from then to the next one
+        "found": none.to(torch.int8),  # by a search, 0 or 1: averages of bool fail
+        "suspect_frames": none,  # in a row
+        "turn": none[0].clone(),  # (): which of many lost ones is searched for next
+    }
+
+
+def advanced(state: State, estimate: Estimate) -> Estimate:
+    """One frame on, in which nothing is suspect: the ``estimate``."""
+    last, since = state["pose"], state["since"]
+    step = (estimate.pose - last).div_(since.unsqueeze(1))
+    state["score"].lerp_(estimate.score, MEMORY)
+    since.fill_(1)
+    state["found"].zero_()
+    state["suspect_frames"].zero_()
+    state["velocity"].copy_(step)
+    last.copy_(estimate.pose)
+    return estimate
+
+
+def advanced_in_doubt(state: State, estimate: Estimate, suspects: list[bool]) -> Estimate:
+    """The same where some are suspect or were, with the last good pose of what was not found. What a search has found
+    is no step: it tells nothing of the velocity, but in the second frame in which it has."""
+    last, usual, velocity = state["pose"], state["score"], state["velocity"]
+    good = Status.good(estimate.status)
+    pose = torch.where(good[:, None], estimate.pose, last)
+    usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
+    step = (pose - last) / state["since"].unsqueeze(1)
+    found = good & (estimate.origin != Origin.TRACKED)
+    leapt = found & ((state["found"] == 0) | (state["since"] > 1))
+    velocity.copy_(torch.where(good[:, None], step.masked_fill_(leapt[:, None], 0.0), velocity))
+    state["found"].copy_(torch.where(good, found, state["found"]))
+    coast(state, good)
+    state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
+    last.copy_(pose)
+    return estimate._replace(pose=pose, displacement=pose - state["start"])
+
+
+def coast(state: State, good: Tensor) -> None:
+    """One frame on, in which those were found that are ``good`` (R,): the others are expected to go on as they went
+    for a while, and then where they were last."""
+    since = state["since"]
+    longer = torch.where(since < KEPT, (since + 1) / since, 0.0)
+    state["velocity"].mul_(torch.where(good, 1.0, longer).unsqueeze(1))
+    since.add_(1).masked_fill_(good, 1)
