@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; the same places as below
+    from torch_ecc.body.body import Body, BodyEstimate
     from torch_ecc.core import pose
     from torch_ecc.core.align import align
     from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
@@ -18,6 +19,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
     from torch_ecc.core.patches import texture
     from torch_ecc.core.reference import Reference, prepare
     from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
+    from torch_ecc.records.lens import Lens
     from torch_ecc.search.locate import Located, Locator, locate
     from torch_ecc.track.frame_mask import suggest_frame_mask
     from torch_ecc.track.stabilise import stabilise
@@ -26,6 +28,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
 __version__ = "0.1.0"
 
 _PLACES = {
+    "body.body": ["Body", "BodyEstimate"],
     "core.pose": ["pose"],
     "core.align": ["align"],
     "core.criteria": ["ECC", "SSD", "Criterion", "PaperECC"],
@@ -33,6 +36,7 @@ _PLACES = {
     "core.patches": ["texture"],
     "core.reference": ["Reference", "prepare"],
     "records.calibration": ["Calibration", "CalibrationFit", "calibrate"],
+    "records.lens": ["Lens"],
     "search.locate": ["Located", "Locator", "locate"],
     "track.frame_mask": ["suggest_frame_mask"],
     "track.stabilise": ["stabilise"],
@@ -42,10 +46,13 @@ _PLACES = {
 __all__ = [
     "ECC",
     "SSD",
+    "Body",
+    "BodyEstimate",
     "Calibration",
     "CalibrationFit",
     "Criterion",
     "Estimate",
+    "Lens",
     "Located",
     "Locator",
     "Origin",
