@@ -168,7 +168,7 @@ def test_frames_and_bodies_together_are_as_each_alone(device):
     pose, covariance = seen(layout, moved(layout, 6))
     pose, good = pose.clone(), torch.rand(6, 16, generator=torch.Generator().manual_seed(1)) > 0.2
     pose[3, 3] += 4.0
-    whole = fuse(*(v.to(device) for v in (pose, covariance, good)), Layout(*(v.to(device) for v in layout)))
+    whole = fuse(*(v.to(device) for v in (pose, covariance, good)), layout.to(device))
     for k in range(6):
         for g, members in enumerate(([0, 1, 4, 5], [2, 3, 6, 7, 11], [9])):
             if not good[k, members].any():

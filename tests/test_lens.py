@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torch_ecc import Lens
-from torch_ecc.core.pose import compose, transform
+from torch_ecc.core.pose import transform
 
 LENS = Lens((530.0, 500.0), (700.0, 690.0), 0.04, -0.01, 0.003, -0.002)
 small = st.floats(-0.05, 0.05)
@@ -49,7 +49,7 @@ def test_poses_go_there_and_back_and_a_patch_is_turned_as_it_is_seen():
     straight = transform(LENS.distort_pose(pose), around) - LENS.distort(pose[:, None, :2])
     cross = (seen[..., 0] * straight[..., 1] - seen[..., 1] * straight[..., 0]).sum(1)
     assert cross.abs().max() < 1e-5  # no turn is left
-    turn, scale = LENS.turn_and_scale(pose[:, :2])
+    _, scale = LENS.turn_and_scale(pose[:, :2])
     area = (seen[:, 0, 0] * seen[:, 1, 1] - seen[:, 0, 1] * seen[:, 1, 0]).abs()
     torch.testing.assert_close(scale.square(), area, rtol=1e-3, atol=0)
 

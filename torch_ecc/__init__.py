@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; the same places as below
     from torch_ecc.body.body import Body, BodyEstimate
+    from torch_ecc.body.calibrate import SelfCalibration, calibrate
     from torch_ecc.core import pose
     from torch_ecc.core.align import align
     from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
     from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
     from torch_ecc.core.patches import texture
     from torch_ecc.core.reference import Reference, prepare
-    from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
+    from torch_ecc.records.calibration import Calibration, CalibrationFit
     from torch_ecc.records.lens import Lens
     from torch_ecc.search.locate import Located, Locator, locate
     from torch_ecc.track.frame_mask import suggest_frame_mask
@@ -29,13 +30,14 @@ __version__ = "0.1.0"
 
 _PLACES = {
     "body.body": ["Body", "BodyEstimate"],
+    "body.calibrate": ["SelfCalibration", "calibrate"],
     "core.pose": ["pose"],
     "core.align": ["align"],
     "core.criteria": ["ECC", "SSD", "Criterion", "PaperECC"],
     "core.estimate": ["Estimate", "Origin", "Reason", "Status", "Track"],
     "core.patches": ["texture"],
     "core.reference": ["Reference", "prepare"],
-    "records.calibration": ["Calibration", "CalibrationFit", "calibrate"],
+    "records.calibration": ["Calibration", "CalibrationFit"],
     "records.lens": ["Lens"],
     "search.locate": ["Located", "Locator", "locate"],
     "track.frame_mask": ["suggest_frame_mask"],
@@ -59,6 +61,7 @@ __all__ = [
     "PaperECC",
     "Reason",
     "Reference",
+    "SelfCalibration",
     "SequenceError",
     "Status",
     "Track",

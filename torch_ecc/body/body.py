@@ -9,11 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from torch_ecc.body.fusion import Fusion, fuse
-from torch_ecc.body.layout import Layout
+from torch_ecc.body.layout import Layout, Response
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.pose import compose, inverse, rotation
 from torch_ecc.core.verdict import unknown
+from torch_ecc.records.lens import Lens
 from torch_ecc.track.tracker import Tracker
 
 USED = 0.5  # of its weight: a patch with less is not counted among those that agree
@@ -91,20 +92,23 @@ class Body(nn.Module):
     """Rigid bodies of the patches of a ``tracker``: called with its estimates, one frame after the other.
 
     ``groups``: the numbers of the patches of each body, by default all are one; a patch may be in no group, and in one
-    at most. Patches should not overlap: the same pixels would count twice. Patches that are not CONVERGED are left out,
-    as are those that disagree with most others (``BodyEstimate.used``); where a body has lost a patch, it tells the
-    tracker where to look for it in the next frame. Called with a whole Track, bodies of all its frames come at once,
-    and the tracker is told nothing. ValueError for what does not fit.
+    at most. Patches should not overlap: the same pixels would count twice. ``lens``: poses are those without its
+    distortion, and residuals those in the frame as it is. Patches that are not CONVERGED are left out, as are those
+    that disagree with most others (``BodyEstimate.used``); where a body has lost a patch, it tells the tracker where to
+    look for it in the next frame. Called with a whole Track, bodies of all its frames come at once, and the tracker is
+    told nothing. ValueError for what does not fit.
     """
 
     before: Tensor
 
-    def __init__(self, tracker: Tracker, groups: Sequence[Sequence[int]] | None = None) -> None:
+    def __init__(
+        self, tracker: Tracker, groups: Sequence[Sequence[int]] | None = None, lens: Lens | None = None
+    ) -> None:
         super().__init__()
         start = tracker.start
         groups = [range(len(start))] if groups is None else groups
         _check_groups(groups, len(start))
-        self.tracker, self.layout = tracker, Layout.of(start, groups)
+        self.tracker, self.layout = tracker, layout_of(tracker, groups, lens)
         self.register_buffer("before", self.layout.start.clone())  # the last good poses, (G, 3)
         self.register_buffer("found", self.layout.start.new_ones(len(groups), dtype=torch.int8))  # in the last frame
         self.register_buffer("apart", start.new_zeros(len(start), dtype=torch.int64))  # frames in a row, of patches
@@ -127,7 +131,7 @@ class Body(nn.Module):
 
     def _layout(self, device: torch.device) -> Layout:
         if self.layout.place.device != device:
-            self.layout = Layout(*(v.to(device) for v in self.layout))
+            self.layout = self.layout.to(device)
         return self.layout
 
     def _guide(self, estimate: Estimate, body: BodyEstimate, layout: Layout) -> None:
@@ -146,6 +150,13 @@ class Body(nn.Module):
             self.tracker.expect(there, step, moved)
         state["found"].copy_(body.ok)
         state["before"].copy_(body.pose)
+
+
+def layout_of(tracker: Tracker, groups: Sequence[Sequence[int]], lens: Lens | None) -> Layout:
+    """Where a tracker's patches are, behind a lens if there is one. ValueError for patches beyond its range."""
+    if lens is None:
+        return Layout.of(tracker.start, groups)
+    return Layout.behind(lens, tracker.start, groups, Response.of(tracker.references[0]))
 
 
 def record(found: Fusion, good: Tensor, layout: Layout, last: Tensor) -> BodyEstimate:

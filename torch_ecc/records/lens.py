@@ -21,8 +21,8 @@ from torch_ecc.core.pose import from_matrix
 
 NEWTON = 8  # steps at most: they double the digits, and only near the fold more than four are needed
 SETTLED = 1e-12  # of the focal length
-DIRECTIONS, RADII = 48, 1500  # in which the fold is looked for
-FARTHEST = 1e3  # focal lengths: beyond that no lens sees
+DIRECTIONS, RADII = 24, 120  # in which the fold is looked for
+NEAREST, FARTHEST = 1e-3, 1e3  # focal lengths
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,9 @@ class Lens:
         x = seen
         for _ in range(NEWTON):
             off = self._seen(x) - seen
-            a, b, c, d = self._slope(x).flatten(-2).unbind(-1)
-            determinant = a * d - b * c
+            slope = self._slope(x)
+            a, b, c, d = slope.flatten(-2).unbind(-1)
+            determinant = _determinant(slope)
             determinant = torch.where(determinant.abs() < 1e-6, 1e-6, determinant)
             step = torch.stack((d * off[..., 0] - b * off[..., 1], a * off[..., 1] - c * off[..., 0]), -1)
             x = x - step / determinant[..., None]
@@ -136,19 +137,22 @@ class Lens:
         """By what a patch at undistorted points (..., 2) is seen turned, (...) rad with the sign of theta, and larger,
         (...)."""
         slope = self.slope(points)
-        return _turn(slope), torch.linalg.det(slope).clamp(min=0).sqrt()
+        return _turn(slope), _determinant(slope).clamp(min=0).sqrt()
 
     @cached_property
     def range_px(self) -> float:
         """Up to how far from the centre what is seen belongs to one point only, px: beyond, the lens folds back."""
-        r = torch.logspace(-3, math.log10(FARTHEST), RADII, dtype=torch.float64)
         angle = 2 * math.pi * torch.arange(DIRECTIONS, dtype=torch.float64) / DIRECTIONS
-        x = r[:, None, None] * torch.stack((angle.cos(), angle.sin()), -1)
-        folded = (torch.linalg.det(self._slope(x)) <= 0).any(1)
-        if not bool(folded.any()):
-            return math.inf
-        last = max(int(folded.to(torch.int8).argmax()) - 1, 0)
-        return float((self._seen(x[last]) * torch.tensor(self.focals).double()).norm(dim=-1).min())
+        around = torch.stack((angle.cos(), angle.sin()), -1)
+        low, high = NEAREST, FARTHEST
+        for _ in range(2):  # roughly, and then in the step where it folds
+            r = torch.logspace(math.log10(low), math.log10(high), RADII, dtype=torch.float64)
+            folded = (_determinant(self._slope(r[:, None, None] * around)) <= 0).any(1)
+            if not bool(folded.any()):
+                return math.inf
+            first = int(folded.to(torch.int8).argmax())
+            low, high = float(r[max(first - 1, 0)]), float(r[first])
+        return float((self._seen(low * around) * around.new_tensor(self.focals)).norm(dim=-1).min())
 
     def check(self, points: Tensor, where: str) -> None:
         """ValueError, which names ``where``, for points seen (..., 2) beyond ``range_px``."""
@@ -158,7 +162,8 @@ class Lens:
         if bool((away > self.range_px).any()):
             far = float(away.max())
             raise ValueError(
-                f"{where}: the lens is one to one up to {self.range_px:.0f} px from its centre, got a point at {far:.0f}"
+                f"{where}: the lens is one to one up to {self.range_px:.0f} px from its centre, "
+                f"got a point at {far:.0f}"
             )
 
     def _normal(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -185,4 +190,11 @@ class Lens:
 
 def _turn(slope: Tensor) -> Tensor:
     """The rotation (...) in (..., 2, 2), with the sign of theta."""
-    return from_matrix(torch.cat((slope, torch.zeros_like(slope[..., :1])), -1))[..., 2]
+    angle: Tensor = from_matrix(torch.cat((slope, torch.zeros_like(slope[..., :1])), -1))[..., 2]
+    return angle
+
+
+def _determinant(slope: Tensor) -> Tensor:
+    a, b, c, d = slope.flatten(-2).unbind(-1)
+    determinant: Tensor = a * d - b * c
+    return determinant
