@@ -152,13 +152,14 @@ class Lens:
                 return math.inf
             first = int(folded.to(torch.int8).argmax())
             low, high = float(r[max(first - 1, 0)]), float(r[first])
-        return float((self._seen(low * around) * around.new_tensor(self.focals)).norm(dim=-1).min())
+        edge = self._seen(low * around) * around.new_tensor(self.focals)
+        return float(torch.linalg.vector_norm(edge, dim=-1).min())
 
     def check(self, points: Tensor, where: str) -> None:
         """ValueError, which names ``where``, for points seen (..., 2) beyond ``range_px``."""
         if self.range_px == math.inf:
             return
-        away = (points - points.new_tensor(self.center)).norm(dim=-1)
+        away = torch.linalg.vector_norm(points - points.new_tensor(self.center), dim=-1)
         if bool((away > self.range_px).any()):
             far = float(away.max())
             raise ValueError(
@@ -185,7 +186,8 @@ class Lens:
         mixed = bend * u * v + 2 * (self.p1 * u + self.p2 * v)
         across = radial + bend * u * u + 2 * self.p1 * v + 6 * self.p2 * u
         down = radial + bend * v * v + 6 * self.p1 * v + 2 * self.p2 * u
-        return torch.stack((across, mixed, mixed, down), -1).unflatten(-1, (2, 2))
+        slope: Tensor = torch.stack((across, mixed, mixed, down), -1).unflatten(-1, (2, 2))
+        return slope
 
 
 def _turn(slope: Tensor) -> Tensor:
