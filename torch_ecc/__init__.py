@@ -11,13 +11,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; the same places as below
+    from torch_ecc.body.body import Body, BodyEstimate
+    from torch_ecc.body.calibrate import SelfCalibration, calibrate
     from torch_ecc.core import pose
     from torch_ecc.core.align import align
     from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
     from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
     from torch_ecc.core.patches import texture
     from torch_ecc.core.reference import Reference, prepare
-    from torch_ecc.records.calibration import Calibration, CalibrationFit, calibrate
+    from torch_ecc.records.calibration import Calibration, CalibrationFit
+    from torch_ecc.records.lens import Lens
     from torch_ecc.search.locate import Located, Locator, locate
     from torch_ecc.track.frame_mask import suggest_frame_mask
     from torch_ecc.track.stabilise import stabilise
@@ -26,13 +29,16 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
 __version__ = "0.1.0"
 
 _PLACES = {
+    "body.body": ["Body", "BodyEstimate"],
+    "body.calibrate": ["SelfCalibration", "calibrate"],
     "core.pose": ["pose"],
     "core.align": ["align"],
     "core.criteria": ["ECC", "SSD", "Criterion", "PaperECC"],
     "core.estimate": ["Estimate", "Origin", "Reason", "Status", "Track"],
     "core.patches": ["texture"],
     "core.reference": ["Reference", "prepare"],
-    "records.calibration": ["Calibration", "CalibrationFit", "calibrate"],
+    "records.calibration": ["Calibration", "CalibrationFit"],
+    "records.lens": ["Lens"],
     "search.locate": ["Located", "Locator", "locate"],
     "track.frame_mask": ["suggest_frame_mask"],
     "track.stabilise": ["stabilise"],
@@ -42,16 +48,20 @@ _PLACES = {
 __all__ = [
     "ECC",
     "SSD",
+    "Body",
+    "BodyEstimate",
     "Calibration",
     "CalibrationFit",
     "Criterion",
     "Estimate",
+    "Lens",
     "Located",
     "Locator",
     "Origin",
     "PaperECC",
     "Reason",
     "Reference",
+    "SelfCalibration",
     "SequenceError",
     "Status",
     "Track",

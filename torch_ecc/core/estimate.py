@@ -106,8 +106,8 @@ _REASONS = {
 class Calibrated(Protocol):
     """What turns pixels into micrometres, such as ``Calibration``."""
 
-    def to_physical(self, displacement: Tensor, /) -> Tensor: ...
-    def covariance(self, covariance: Tensor, /) -> Tensor: ...
+    def to_physical(self, displacement: Tensor, pose: Tensor, /) -> Tensor: ...
+    def covariance(self, covariance: Tensor, pose: Tensor, /) -> Tensor: ...
 
 
 class Physical(NamedTuple):
@@ -186,8 +186,11 @@ class Estimate(NamedTuple):
 
     def to_um(self, calibration: Calibrated) -> Physical:
         """The displacements in um, um, rad along the calibration's axes (eq. 3); NaN where a template was not found."""
-        moved = calibration.to_physical(self.displacement)
-        return Physical(torch.where(self.ok[..., None], moved, torch.nan), calibration.covariance(self.covariance))
+        moved, spread = (
+            calibration.to_physical(self.displacement, self.pose),
+            calibration.covariance(self.covariance, self.pose),
+        )
+        return Physical(torch.where(self.ok[..., None], moved, torch.nan), spread)
 
     def to_pandas(self) -> DataFrame:
         """A pandas.DataFrame of one row per template (and frame): the columns of track.csv and the other fields.

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.pose import rotation
+from torch_ecc.records.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -18,11 +19,13 @@ class Calibration:
 
     ``um_per_px``: one number or (f_x, f_y), eq. (3); a negative one says that this axis of the stage runs against the
     image's (stages usually count y upwards). ``axis_angle``: rad, from the camera's axes to the stage's, with the sign
-    of theta in eq. (2). Raises ValueError for a scale that is zero or not finite.
+    of theta in eq. (2). ``lens``: what it distorts is taken out first, for which it has to be known where in the frame
+    a displacement has ended. Raises ValueError for a scale that is zero or not finite.
     """
 
     um_per_px: float | tuple[float, float]
     axis_angle: float = 0.0
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         if len(self.scales) != 2 or not all(math.isfinite(f) and f != 0 for f in self.scales):
@@ -44,16 +47,28 @@ class Calibration:
         whole[2, 2] = math.copysign(1.0, math.prod(self.scales))  # a mirrored view turns the other way
         return whole
 
-    def to_physical(self, displacement: Tensor) -> Tensor:
-        """Displacements (..., 3) px, px, rad -> (..., 3) um, um, rad along the stage's axes (eq. 3)."""
+    def to_physical(self, displacement: Tensor, pose: Tensor | None = None) -> Tensor:
+        """Displacements (..., 3) px, px, rad -> (..., 3) um, um, rad along the stage's axes (eq. 3). With a lens they
+        must come with the ``pose`` (..., 3) that they have led to; ValueError without, and beyond the lens's range."""
+        if self.lens is not None:
+            end = self._known(pose)
+            displacement = self.lens.undistort_pose(end) - self.lens.undistort_pose(end - displacement)
         return _product(displacement[..., None, :], self.matrix(displacement).mT)[..., 0, :]
 
+    def _known(self, pose: Tensor | None) -> Tensor:
+        if pose is None:
+            raise ValueError("Calibration: with a lens the pose must be known, too, got a displacement alone")
+        return pose
+
     def to_pixels(self, physical: Tensor) -> Tensor:
-        """The inverse of ``to_physical``: (..., 3) um, um, rad -> (..., 3) px, px, rad."""
+        """The inverse of ``to_physical``, as without a lens: (..., 3) um, um, rad -> (..., 3) px, px, rad."""
         return _product(physical[..., None, :], torch.linalg.inv(self.matrix(physical)).mT)[..., 0, :]
 
-    def covariance(self, covariance: Tensor) -> Tensor:
-        """Pose covariances (..., 3, 3) in px and rad -> in um and rad along the stage's axes."""
+    def covariance(self, covariance: Tensor, pose: Tensor | None = None) -> Tensor:
+        """Pose covariances (..., 3, 3) in px and rad -> in um and rad along the stage's axes; with a lens, at poses
+        (..., 3)."""
+        if self.lens is not None:
+            covariance = self.lens.undistort_covariance(covariance, self._known(pose))
         whole = self.matrix(covariance)
         return _product(_product(whole, covariance), whole.mT)
 

@@ -277,6 +277,14 @@ class Tracker(nn.Module):
         unknown, moved = torch.diag_embed(torch.full_like(pose, torch.inf)), pose - state["start"]
         return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone(), reason)
 
+    @torch.no_grad()
+    def expect(self, pose: Tensor, step: Tensor, which: Tensor) -> None:
+        """The templates ``which`` (R,) bool are at ``pose`` (R, 3) and have moved by ``step`` (R, 3) since the frame
+        before, as something else knows: there they are looked for next, and this is their last good pose."""
+        state: Any = self._buffers
+        for name, value in (("pose", pose), ("velocity", step)):
+            state[name].copy_(torch.where(which[:, None], value, state[name]))
+
     def track_sequence(self, frames: Iterable[Tensor | None], *, stop_at_damage: bool = False) -> Track:
         """Poses in every frame of a sequence: Track (F, R, ...).
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from torch_ecc.sim.camera import optics, sensor
 from torch_ecc.sim.camera.light import Light
 from torch_ecc.sim.camera.occluder import Occluder
-from torch_ecc.sim.scene.scene import Rendered
+from torch_ecc.sim.scene.scene import Rendered, Scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +19,7 @@ class Camera:
     """Settings of a camera. Grey levels are on the nominal 0..255 scale whatever ``bits`` is."""
 
     size: tuple[int, int] = (480, 640)  # (h, w) px
+    lens: optics.Distortion | None = None  # shows things elsewhere; poses are those without it
     light: Light | None = None  # multiplies the scene; None is even light
     blur_sigma: float = 0.0  # px, Gaussian blur of the optics
     defocus_radius: float = 0.0  # px, radius of the disc that a point becomes out of focus
@@ -74,13 +76,21 @@ class Camera:
             times = [self.exposure * (step / self.exposure_steps - 0.5) for step in steps]
             frames = torch.zeros((len(poses), 1, *padded), device=poses.device)
             for t in times:
-                frames += scene.render(shifted + t * velocities, padded) / len(times)
+                frames += self._look(scene, shifted + t * velocities, padded, margin) / len(times)
         else:
-            frames = scene.render(shifted, padded)
+            frames = self._look(scene, shifted, padded, margin)
         frames = optics.focus(frames, self.blur_sigma, self.defocus_radius)
         for occluder in self.occluders:
             frames = occluder.cover(frames, indices)
         return frames if self.light is None else frames * self.light.field(indices, self.size)
+
+    def _look(self, scene: Rendered, poses: Tensor, size: tuple[int, int], margin: int) -> Tensor:
+        """The scene through the lens, before any blur: (B, 3) -> (B, 1, h, w)."""
+        if self.lens is None:
+            return scene.render(poses, size)
+        if not (hasattr(scene, "value")):
+            raise ValueError(f"Camera: a lens needs a scene with exact values, got {type(scene).__name__}")
+        return optics.distorted(cast("Scene", scene), self.lens, poses, size, margin)
 
     def _sense(self, frames: Tensor, indices: Tensor, seed: int) -> Tensor:
         """Gain, offset, noise and quantisation: (B, 1, h, w) float32 -> the camera's dtype."""
