@@ -105,8 +105,11 @@ def track(config: str | None, write_config: str | None, **options: Any) -> None:
         console.print(remark, soft_wrap=True, markup=False)
     with progress_bar(session.source.name, session.source.length) as advance:
         finished = session.run(advance)
-    _report(finished)
+    for line in finished.words():
+        console.print(line, soft_wrap=True, markup=False)
     if finished.interrupted:
+        if finished.frames:
+            console.print("The same command with --resume goes on from there.")
         sys.exit(INTERRUPTED)
 
 
@@ -205,42 +208,6 @@ def servo(config: str, **options: Any) -> None:
         console.print(line, soft_wrap=True)
     if not run.alignment.aligned:
         sys.exit(INTERRUPTED if run.alignment.ending.name == "INTERRUPTED" else 1)
-
-
-def _report(finished: Any) -> None:
-    """Say in words what became of a run."""
-    from torch_ecc.core.estimate import Reason
-
-    for number, lost in enumerate(finished.lost.tolist()):
-        if lost:
-            sentence = Reason.describe(int(finished.last_reason[number]))
-            console.print(
-                f"Template {number} was not found in {lost} of {finished.frames} frames. Last frame: {sentence}",
-                soft_wrap=True,
-            )
-    if finished.damaged:
-        console.print(f"{finished.damaged} of {finished.frames} frames are damaged: track.csv says which and why")
-    _say_reasons(finished)
-    end = "Stopped after" if finished.interrupted else "Tracked"
-    names = (
-        ", ".join(sorted(path.name for path in finished.folder.iterdir() if path.suffix != ".part"))
-        if finished.frames
-        else "nothing"
-    )
-    console.print(f"{end} {finished.frames} frames. In {finished.folder}/: {names}", soft_wrap=True, markup=False)
-    if finished.interrupted and finished.frames:
-        console.print("The same command with --resume goes on from there.")
-
-
-def _say_reasons(finished: Any) -> None:
-    """How many rows of the table speak against themselves, and why: the most frequent reason first."""
-    from torch_ecc.core.estimate import Reason
-
-    counts = sorted(zip(finished.reasons.tolist(), Reason, strict=True), key=lambda each: -each[0])
-    words = [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]
-    if words:
-        rows, doubted = int(finished.reasons.sum()), int(finished.reasons[1:].sum())
-        console.print(f"{doubted} of {rows} rows are not to be trusted: {', '.join(words)}", soft_wrap=True)
 
 
 class _Rate(ProgressColumn):
