@@ -23,6 +23,21 @@ INTERRUPTED = 130
 
 console = Console(highlight=False)
 
+TRACKING = options_of(
+    TrackJob,
+    without=("input",),
+    centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
+    size={"type": str, "metavar": "N|H,W", "callback": read_size},
+    um_per_px={"type": str, "metavar": "S|SX,SY", "callback": read_scale},
+    polygons={
+        "flag": "--polygon",
+        "type": str,
+        "multiple": True,
+        "metavar": "'X,Y X,Y ...'",
+        "callback": read_polygons,
+    },
+)
+
 
 def _say_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     """And which engine serves on this computer's processor."""
@@ -72,20 +87,7 @@ def demo(out: str, frames: int) -> None:
     flag_value="-",
     help="Write all settings, commented, as a file for --config, and do nothing else; without FILE, to the screen.",
 )
-@options_of(
-    TrackJob,
-    without=("input",),
-    centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
-    size={"type": str, "metavar": "N|H,W", "callback": read_size},
-    um_per_px={"type": str, "metavar": "S|SX,SY", "callback": read_scale},
-    polygons={
-        "flag": "--polygon",
-        "type": str,
-        "multiple": True,
-        "metavar": "'X,Y X,Y ...'",
-        "callback": read_polygons,
-    },
-)
+@TRACKING
 def track(config: str | None, write_config: str | None, **options: Any) -> None:
     """Track patches through a video: x, y and theta of each in every frame.
 
@@ -111,6 +113,30 @@ def track(config: str | None, write_config: str | None, **options: Any) -> None:
         if finished.frames:
             console.print("The same command with --resume goes on from there.")
         sys.exit(INTERRUPTED)
+
+
+@app.command()
+@click.argument("input")
+@click.option("--port", default=0, show_default="any that is free", help="Of the page, on 127.0.0.1.")
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
+@TRACKING
+def pick(port: int, browser: bool, **options: Any) -> None:
+    """Mark patches on a page in the browser, see how well each can be tracked, track, watch, download.
+
+    INPUT is what track reads, or the folder of a result, to look at its frames beside its curves. Options are those of
+    track, and where the page begins.
+    """
+    from torch_ecc.view import serve
+
+    serve(given(options), port, show=lambda url: _show(url, browser))
+
+
+def _show(url: str, browser: bool) -> None:
+    """Tell people where the page is, and open it."""
+    console.print(f"The page: {url}", soft_wrap=True, markup=False)
+    console.print("Ctrl-C ends it.")
+    if browser:
+        click.launch(url)
 
 
 @app.command()

@@ -240,7 +240,7 @@ class _Run:
         try:
             if frame.pixels is None:
                 raise ValueError(frame.damage)
-            estimate = self.tracker(frame.pixels)
+            estimate: Estimate = self.tracker(frame.pixels)
         except ValueError as error:
             if self.stop_at_damage:
                 raise ValueError(f"frame {frame.number}: {error}") from error

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_ecc.core.ambient import plain
+from torch_ecc.core.ambient import plain, threads_for
 from torch_ecc.core.frame import as_gray, require_tensor
 from torch_ecc.core.noise import INSTRUMENT_BLUR, LEAST_NOISE, wiener_weight
 from torch_ecc.core.normal import Moments, normal_equations
@@ -106,7 +106,8 @@ def texture_map(frame: Tensor, size: Size, *, step: int | None = None) -> Textur
     windows = _Windows((h, w), step or max(min(h, w) // FINENESS, coarsest))
     rounding = 0.0 if require_tensor("texture_map", "frame", frame).is_floating_point() else QUANTISATION
     y, x = windows.middles(gray.shape)
-    sigma = _predicted(gray, windows, rounding)
+    with threads_for(gray.numel()):
+        sigma = _predicted(gray, windows, rounding)
     return TextureMap(sigma.view(len(y), len(x), 3), x, y, (h, w))
 
 
