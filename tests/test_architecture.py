@@ -15,10 +15,10 @@ PACKAGE = Path(torch_ecc.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 # From the bottom up; a package may import what stands before it, not what stands beside or after it.
-FLOORS = [{"core"}, {"search"}, {"track"}, {"servo", "body"}, {"commands"}, {"paper"}, {"cli"}]
+FLOORS = [{"core"}, {"search"}, {"track"}, {"servo", "body"}, {"commands"}, {"paper", "view"}, {"cli"}]
 # Leaves import nothing of the package but pose; what may use them, beside the floors above ``track``.
 LEAVES = {"io", "plots", "records", "config", "sim"}
-LEAF_USERS = {"commands", "paper", "cli"}
+LEAF_USERS = {"commands", "paper", "view", "cli"}
 LEAVES_BELOW = {("servo", "records"), ("body", "records"), ("sim", "config")}
 ROOMS = {"sim": ["scene", "camera", "stage"]}  # the floors of a leaf, from the bottom up
 

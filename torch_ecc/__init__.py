@@ -1,8 +1,9 @@
 """Planar pose tracking (x, y, theta) of textured patches, to a thousandth of a pixel, with an honest uncertainty.
 
 ``Tracker`` follows patches through a video; ``prepare`` and ``align`` are the pure functions under it; ``locate``
-finds a patch anywhere, at any angle; ``texture`` judges it beforehand; ``stabilise`` warps frames back onto the first;
-``Calibration`` turns pixels into micrometres. Conventions: see ``torch_ecc.pose``.
+finds a patch anywhere, at any angle; ``texture`` judges it beforehand, ``texture_map`` every place of a frame;
+``stabilise`` warps frames back onto the first; ``Calibration`` turns pixels into micrometres. Conventions: see
+``torch_ecc.pose``.
 
 Names are fetched when they are first used: ``import torch_ecc`` alone does not even bring torch.
 """
@@ -19,6 +20,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
     from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
     from torch_ecc.core.patches import texture
     from torch_ecc.core.reference import Reference, prepare
+    from torch_ecc.core.texture_map import TextureMap, texture_map
     from torch_ecc.records.calibration import Calibration, CalibrationFit
     from torch_ecc.records.lens import Lens
     from torch_ecc.search.locate import Located, Locator, locate
@@ -37,6 +39,7 @@ _PLACES = {
     "core.estimate": ["Estimate", "Origin", "Reason", "Status", "Track"],
     "core.patches": ["texture"],
     "core.reference": ["Reference", "prepare"],
+    "core.texture_map": ["TextureMap", "texture_map"],
     "records.calibration": ["Calibration", "CalibrationFit"],
     "records.lens": ["Lens"],
     "search.locate": ["Located", "Locator", "locate"],
@@ -64,6 +67,7 @@ __all__ = [
     "SelfCalibration",
     "SequenceError",
     "Status",
+    "TextureMap",
     "Track",
     "Tracker",
     "align",
@@ -74,6 +78,7 @@ __all__ = [
     "stabilise",
     "suggest_frame_mask",
     "texture",
+    "texture_map",
 ]
 
 

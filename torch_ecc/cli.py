@@ -23,6 +23,22 @@ INTERRUPTED = 130
 
 console = Console(highlight=False)
 
+TRACKING = options_of(
+    TrackJob,
+    without=("input",),
+    centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
+    size={"type": str, "metavar": "N|H,W", "callback": read_size},
+    um_per_px={"type": str, "metavar": "S|SX,SY", "callback": read_scale},
+    max_step={"nargs": 2, "type": float, "metavar": "PX DEG"},
+    polygons={
+        "flag": "--polygon",
+        "type": str,
+        "multiple": True,
+        "metavar": "'X,Y X,Y ...'",
+        "callback": read_polygons,
+    },
+)
+
 
 def _say_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     """And which engine serves on this computer's processor."""
@@ -72,21 +88,7 @@ def demo(out: str, frames: int) -> None:
     flag_value="-",
     help="Write all settings, commented, as a file for --config, and do nothing else; without FILE, to the screen.",
 )
-@options_of(
-    TrackJob,
-    without=("input",),
-    centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
-    size={"type": str, "metavar": "N|H,W", "callback": read_size},
-    um_per_px={"type": str, "metavar": "S|SX,SY", "callback": read_scale},
-    max_step={"nargs": 2, "type": float, "metavar": "PX DEG"},
-    polygons={
-        "flag": "--polygon",
-        "type": str,
-        "multiple": True,
-        "metavar": "'X,Y X,Y ...'",
-        "callback": read_polygons,
-    },
-)
+@TRACKING
 def track(config: str | None, write_config: str | None, **options: Any) -> None:
     """Track patches through a video: x, y and theta of each in every frame.
 
@@ -106,9 +108,36 @@ def track(config: str | None, write_config: str | None, **options: Any) -> None:
         console.print(remark, soft_wrap=True, markup=False)
     with progress_bar(session.source.name, session.source.length) as advance:
         finished = session.run(advance)
-    _report(finished)
+    for line in finished.words():
+        console.print(line, soft_wrap=True, markup=False)
     if finished.interrupted:
+        if finished.frames:
+            console.print("The same command with --resume goes on from there.")
         sys.exit(INTERRUPTED)
+
+
+@app.command()
+@click.argument("input")
+@click.option("--port", default=0, show_default="any that is free", help="Of the page, on 127.0.0.1.")
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
+@TRACKING
+def pick(port: int, browser: bool, **options: Any) -> None:
+    """Mark patches on a page in the browser, see how well each can be tracked, track, watch, download.
+
+    INPUT is what track reads, or the folder of a result, to look at its frames beside its curves. Options are those of
+    track, and where the page begins.
+    """
+    from torch_ecc.view import serve
+
+    serve(given(options), port, show=lambda url: _show(url, browser))
+
+
+def _show(url: str, browser: bool) -> None:
+    """Tell people where the page is, and open it."""
+    console.print(f"The page: {url}", soft_wrap=True, markup=False)
+    console.print("Ctrl-C ends it.")
+    if browser:
+        click.launch(url)
 
 
 @app.command()
@@ -206,42 +235,6 @@ def servo(config: str, **options: Any) -> None:
         console.print(line, soft_wrap=True)
     if not run.alignment.aligned:
         sys.exit(INTERRUPTED if run.alignment.ending.name == "INTERRUPTED" else 1)
-
-
-def _report(finished: Any) -> None:
-    """Say in words what became of a run."""
-    from torch_ecc.core.estimate import Reason
-
-    for number, lost in enumerate(finished.lost.tolist()):
-        if lost:
-            sentence = Reason.describe(int(finished.last_reason[number]))
-            console.print(
-                f"Template {number} was not found in {lost} of {finished.frames} frames. Last frame: {sentence}",
-                soft_wrap=True,
-            )
-    if finished.damaged:
-        console.print(f"{finished.damaged} of {finished.frames} frames are damaged: track.csv says which and why")
-    _say_reasons(finished)
-    end = "Stopped after" if finished.interrupted else "Tracked"
-    names = (
-        ", ".join(sorted(path.name for path in finished.folder.iterdir() if path.suffix != ".part"))
-        if finished.frames
-        else "nothing"
-    )
-    console.print(f"{end} {finished.frames} frames. In {finished.folder}/: {names}", soft_wrap=True, markup=False)
-    if finished.interrupted and finished.frames:
-        console.print("The same command with --resume goes on from there.")
-
-
-def _say_reasons(finished: Any) -> None:
-    """How many rows of the table speak against themselves, and why: the most frequent reason first."""
-    from torch_ecc.core.estimate import Reason
-
-    counts = sorted(zip(finished.reasons.tolist(), Reason, strict=True), key=lambda each: -each[0])
-    words = [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]
-    if words:
-        rows, doubted = int(finished.reasons.sum()), int(finished.reasons[1:].sum())
-        console.print(f"{doubted} of {rows} rows are not to be trusted: {', '.join(words)}", soft_wrap=True)
 
 
 class _Rate(ProgressColumn):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, fields
@@ -109,12 +110,43 @@ def _polygon(text: str) -> list[list[float]]:
 def track_toml(values: Mapping[str, Any], where: str = "track") -> str:
     """All settings of a tracking run as a commented file with these ``values``, which are checked, and with an example
     of what there must be."""
-    placed = values.keys() & {"centers", "polygons", "template"}
+    placed = values.keys() & {"centers", "polygons", "grid", "template"}
     examples = {each.name: each.metadata.get("example") for each in fields(TrackJob)}
     needed = ("input",) if placed else ("input", "centers", "size")
     values = {name: examples[name] for name in needed} | dict(values)
     fill(TrackJob, values, where)
     return HEAD + write_toml(TrackJob, values)
+
+
+def track_command(values: Mapping[str, Any]) -> str:
+    """The command that runs a job with these ``values``, as a shell reads it."""
+    words = ["torch-ecc", "track", str(values["input"])]
+    for each in chain(*paragraphs(TrackJob)):
+        value, flag = values.get(each.name, each.default), f"--{each.name.replace('_', '-')}"
+        if each.name == "input" or value in (None, each.default) or not (value or each.default):
+            continue
+        if isinstance(value, bool):
+            words.append(flag if value else flag.replace("--", "--no-", 1))
+        elif each.name in _REPEATED:
+            flag, form = _REPEATED[each.name]
+            words += chain(*([flag, *form(item)] for item in value))
+        else:
+            words += [flag, _plain(value)]
+    return shlex.join(words)
+
+
+def _plain(value: Any) -> str:
+    """A number, a text, or numbers with commas between."""
+    if isinstance(value, list | tuple):
+        return ",".join(map(_plain, value))
+    return f"{value:.15g}" if isinstance(value, float) else str(value)
+
+
+_REPEATED: dict[str, tuple[str, Callable[[Any], list[str]]]] = {
+    "centers": ("--center", lambda center: [_plain(number) for number in center]),
+    "polygons": ("--polygon", lambda corners: [" ".join(map(_plain, corners))]),
+    "template": ("--template", lambda name: [name]),
+}
 
 
 def write_new(text: str, file: str) -> None:

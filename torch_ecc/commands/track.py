@@ -18,7 +18,7 @@ from torch import Tensor
 from torch_ecc.commands.jobs import TrackJob, span
 from torch_ecc.commands.templates import Templates, choose_templates, read_frame_mask, read_templates, refuse_doubt
 from torch_ecc.core.ambient import threads_for
-from torch_ecc.core.estimate import Reason, Status
+from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.io import Frame, OverlayWriter, TrackWriter, open_frames
 from torch_ecc.io.beside import ahead
 from torch_ecc.io.journal import Unfinished
@@ -49,6 +49,24 @@ class Finished(NamedTuple):
     reasons: NDArray[np.int64]
     folder: Path
     interrupted: bool
+
+    def words(self) -> list[str]:
+        """The same in sentences."""
+        said = [
+            f"Template {number} was not found in {lost} of {self.frames} frames. "
+            f"Last frame: {Reason.describe(int(self.last_reason[number]))}"
+            for number, lost in enumerate(self.lost.tolist())
+            if lost
+        ]
+        if self.damaged:
+            said.append(f"{self.damaged} of {self.frames} frames are damaged: track.csv says which and why")
+        counts = sorted(zip(self.reasons.tolist(), Reason, strict=True), key=lambda each: -each[0])
+        if reasons := [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]:
+            rows, doubted = int(self.reasons.sum()), int(self.reasons[1:].sum())
+            said.append(f"{doubted} of {rows} rows are not to be trusted: {', '.join(reasons)}")
+        whole = sorted(path.name for path in self.folder.iterdir() if path.suffix != ".part") if self.frames else []
+        end, names = "Stopped after" if self.interrupted else "Tracked", ", ".join(whole) or "nothing"
+        return [*said, f"{end} {self.frames} frames. In {self.folder}/: {names}"]
 
 
 class Session:
@@ -97,11 +115,16 @@ class Session:
             remarks.append(f"{len(self.templates.centers)} templates where there is texture enough")
         return remarks
 
-    def run(self, progress: Callable[[int], None] = lambda done: None) -> Finished:
+    def run(
+        self,
+        progress: Callable[[int], None] = lambda done: None,
+        watch: Callable[[Frame, Estimate], None] = lambda frame, estimate: None,
+    ) -> Finished:
         """Track every frame and write track.csv, track.npz, track.png, summary.json and the videos.
 
-        ``progress`` is told how many frames are done. Ctrl-C ends the run and keeps what it had; so does an error,
-        which is raised again once everything before it is written.
+        ``progress`` is told how many frames are done, ``watch`` is shown each with its poses. Ctrl-C, or a
+        KeyboardInterrupt from one of them, ends the run and keeps what it had; so does an error, which is raised again
+        once everything before it is written.
         """
         with claim(self.folder):
             films = [film for film in (self._overlay(), self._stabilised()) if film is not None]
@@ -114,7 +137,7 @@ class Session:
                 with run:
                     frames = self._frames(left)
                     for frame in ahead(map(with_picture, frames) if films else frames):
-                        run.step(frame)
+                        watch(frame, run.step(frame))
                         progress(run.done)
             except (KeyboardInterrupt, ValueError) as error:
                 stopped = error
@@ -212,12 +235,12 @@ class _Run:
     def __exit__(self, *error: Any) -> None:
         self._open.__exit__(*error)
 
-    def step(self, frame: Frame) -> None:
-        """One frame more. ValueError for one that is damaged, if that is to be the end."""
+    def step(self, frame: Frame) -> Estimate:
+        """One frame more, and what was found in it. ValueError for one that is damaged, if that is to be the end."""
         try:
             if frame.pixels is None:
                 raise ValueError(frame.damage)
-            estimate = self.tracker(frame.pixels)
+            estimate: Estimate = self.tracker(frame.pixels)
         except ValueError as error:
             if self.stop_at_damage:
                 raise ValueError(f"frame {frame.number}: {error}") from error
@@ -227,6 +250,7 @@ class _Run:
         for film in self.films:
             film.write(frame, estimate)
         self._count(*(code.cpu().numpy()[None] for code in (estimate.status, estimate.reason)))
+        return estimate
 
     @property
     def counts(self) -> tuple[int, int, NDArray[np.int64], NDArray[np.int8], NDArray[np.int64]]:

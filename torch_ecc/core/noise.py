@@ -28,9 +28,11 @@ def wiener_weight(gradient: Tensor, noise: Tensor) -> Tensor:
     """How much of the blurred ``gradient`` (B, 2, h, w) is texture, not ``noise`` (B,), near each pixel: (B, 1, h, w).
 
     The factor S / (S + N / 2) that makes the scatter of two equally noisy images least, from the gradient's power
-    nearby. Where a template is flat its gradient is all noise, which as an instrument would only add scatter.
+    nearby. Where a template is flat its gradient is all noise, which as an instrument would only add scatter. The noise
+    may vary from pixel to pixel, (B, 1, h, w).
     """
-    floor = 2 * noise_response()[1] * noise.to(gradient.dtype).square()[:, None, None, None]
+    noise = noise.view(-1, 1, 1, 1) if noise.dim() == 1 else noise
+    floor = 2 * noise_response()[1] * noise.to(gradient.dtype).square()
     power = (blur(gradient.square().sum(1, keepdim=True), NEARBY) - CERTAIN * floor).clamp(min=0)
     return power / (power + floor / 2).clamp(min=1e-30)
 

@@ -333,7 +333,12 @@ def noise_level(image: Tensor, kept: Tensor) -> Tensor:
     along rows or columns; what fine texture leaves in it counts as noise. Where the image is clipped there is none.
     """
     kept = kept * ~clipped(image)
+    response = torch.where(kept[:, :, 1:-1, 1:-1] > 0, noise_samples(image), float("nan"))
+    return response.flatten(1).nanmedian(-1).values.nan_to_num()
+
+
+def noise_samples(image: Tensor) -> Tensor:
+    """What the inner pixels of (B, 1, H, W) say of its noise, whose standard deviation is the median of them: all but
+    the border, (B, 1, H - 2, W - 2)."""
     kernel = image.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])[None, None]
-    response = F.conv2d(image, kernel).abs().flatten(1) / 6
-    response = torch.where(kept[:, :, 1:-1, 1:-1].flatten(1) > 0, response, float("nan"))
-    return response.nanmedian(-1).values.nan_to_num() / 0.6745
+    return F.conv2d(image, kernel).abs() / (6 * 0.6745)
