@@ -2,7 +2,7 @@
 
 ``Tracker`` follows patches through a video; ``prepare`` and ``align`` are the pure functions under it; ``locate``
 finds a patch anywhere, at any angle; ``texture`` judges it beforehand; ``stabilise`` warps frames back onto the first;
-``Calibration`` turns pixels into micrometres. Conventions: see ``torch_ecc.pose``.
+``batch`` tracks many recordings; ``Calibration`` turns pixels into micrometres. Conventions: see ``torch_ecc.pose``.
 
 Names are fetched when they are first used: ``import torch_ecc`` alone does not even bring torch.
 """
@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; the same places as below
+    from torch_ecc.commands.batch import Batch, batch
     from torch_ecc.core import pose
     from torch_ecc.core.align import align
     from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
@@ -26,6 +27,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
 __version__ = "0.1.0"
 
 _PLACES = {
+    "commands.batch": ["Batch", "batch"],
     "core.pose": ["pose"],
     "core.align": ["align"],
     "core.criteria": ["ECC", "SSD", "Criterion", "PaperECC"],
@@ -42,6 +44,7 @@ _PLACES = {
 __all__ = [
     "ECC",
     "SSD",
+    "Batch",
     "Calibration",
     "CalibrationFit",
     "Criterion",
@@ -57,6 +60,7 @@ __all__ = [
     "Track",
     "Tracker",
     "align",
+    "batch",
     "calibrate",
     "locate",
     "pose",

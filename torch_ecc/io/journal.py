@@ -116,7 +116,9 @@ class Journal:
     def go_on(folder: Path, left: Unfinished) -> Journal:
         """With the files of a run before, after the frames that are ``left``."""
         path = part(folder, _TABLE)
-        if rows_file(folder) != path:  # it was ended in order: its table has its name already, and keeps it until the end
+        if (
+            rows_file(folder) != path
+        ):  # it was ended in order: its table has its name already, and keeps it until the end
             path.unlink(missing_ok=True)
             shutil.copyfile(rows_file(folder), path)
         with path.open("rb") as file:
