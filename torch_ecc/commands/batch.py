@@ -193,9 +193,10 @@ class _Run:
                     raise ConnectionError("scheduler: it is gone; the same call goes on when there is one") from None
                 say("The scheduler is gone: waiting for it to come back")
                 deadline = time.monotonic() + RECONNECT
-            except ValueError:
+            except (ValueError, OSError):
                 if time.monotonic() > deadline:
                     raise
+                time.sleep(1.0)
 
     def _cluster(self) -> Any:
         workers = min(self.job.workers or cores(), len(self.todo) * self.job.parts)

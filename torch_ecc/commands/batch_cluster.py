@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 PATIENCE = 20.0  # s to wait for a scheduler, and for its first worker
+CLOSING = 3.0  # s that it may take to say goodbye
 GPU = "GPU"  # the resource that a worker with one has
 
 
@@ -37,19 +38,31 @@ def connected(scheduler: str | None, workers: int, *, gpu: bool) -> Iterator[Cli
             yield client
         return
     from distributed import Client
+    from distributed import TimeoutError as Late
 
-    quiet = logging.getLogger("distributed")
-    before = quiet.level
-    quiet.setLevel(logging.CRITICAL)
+    with _quiet():
+        try:
+            client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
+        except (OSError, ValueError) as error:
+            how = "dask scheduler starts one, and says its address"
+            raise ValueError(f"scheduler: nobody answers at {scheduler} ({how}; {type(error).__name__})") from error
+        try:
+            yield client
+        finally:
+            with suppress(Late):  # it is looking for a scheduler that is gone
+                client.close(timeout=CLOSING)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """What Dask would say is said in other words here."""
+    logger = logging.getLogger("distributed.client")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
     try:
-        client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError) as error:
-        how = "dask scheduler starts one, and says its address"
-        raise ValueError(f"scheduler: nobody answers at {scheduler} ({how}; {type(error).__name__})") from error
+        yield
     finally:
-        quiet.setLevel(before)
-    with client:
-        yield client
+        logger.setLevel(before)
 
 
 @contextmanager
@@ -88,16 +101,20 @@ def check_cluster(client: Client, out: Path, *, gpu: bool) -> None:
     from distributed import TimeoutError as Late
 
     address = client.scheduler.address if client.scheduler else "?"
+    nobody = ValueError(f"scheduler: no worker has joined {address}: dask worker {address} starts one")
     try:
         client.wait_for_workers(1, timeout=PATIENCE)
     except Late:
-        raise ValueError(f"scheduler: no worker has joined {address}: dask worker {address} starts one") from None
+        raise nobody from None
     probe = out / WORK / f"probe-{secrets.token_hex(4)}"
     probe.write_text(probe.name)
     try:
         found = client.run(_look, str(probe), on_error="return")
     finally:
         probe.unlink()
+    found = {worker: seen for worker, seen in found.items() if not isinstance(seen, OSError)}  # those have left
+    if not found:
+        raise nobody
     for worker, seen in found.items():
         _check_worker(worker, seen, out)
     if gpu and not any(GPU in seen["resources"] for seen in found.values()):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import secrets
 import time
+from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -64,6 +65,12 @@ class Queue:
             withdraw()
             self._wind_up()
             raise
+        except (OSError, RuntimeError, CancelledError) as error:  # what Dask says before it knows that nobody is there
+            if isinstance(error, RuntimeError) and client.status == "running":
+                raise
+            self._again.extend(self._out.values())
+            self._out.clear()
+            raise SchedulerGoneError from error
 
     def _hand_out(self, client: Client, back: Any) -> int:
         """As many as are wanted; how many are out then."""
@@ -83,9 +90,7 @@ class Queue:
     def _settle(self, future: Future) -> None:
         """One has come back, or is lost."""
         if future.status not in ("finished", "error"):
-            self._again.extend(self._out.values())
-            self._out.clear()
-            raise SchedulerGoneError
+            raise ConnectionError(f"{future.key} is lost")
         task = self._out.pop(future)
         row = self._row(task, future)
         if row["status"] == UNFINISHED and task.tries < TRIES:
