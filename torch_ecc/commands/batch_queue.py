@@ -81,7 +81,8 @@ class Queue:
             task = self._again.popleft() if self._again else next(self._tasks, None)
             if task is None:
                 break
-            name = f"{task.key}-{secrets.token_hex(4)}"
+            # A scheduler remembers every group of keys that it has seen: all of ours are of one.
+            name = (f"torch_ecc.{task.make.__name__}", task.key, secrets.token_hex(4))
             future = client.submit(task.make, task.work, *task.rest, key=name, pure=False, resources=self._resources)
             self._out[future] = task
             back.add(future)
@@ -90,7 +91,7 @@ class Queue:
     def _settle(self, future: Future) -> None:
         """One has come back, or is lost."""
         if future.status not in ("finished", "error"):
-            raise ConnectionError(f"{future.key} is lost")
+            raise ConnectionError(f"{self._out[future].key} is lost")
         task = self._out.pop(future)
         row = self._row(task, future)
         if row["status"] == UNFINISHED and task.tries < TRIES:
