@@ -2,8 +2,8 @@
 
 ``Tracker`` follows patches through a video; ``prepare`` and ``align`` are the pure functions under it; ``locate``
 finds a patch anywhere, at any angle; ``texture`` judges it beforehand, ``texture_map`` every place of a frame;
-``stabilise`` warps frames back onto the first; ``Calibration`` turns pixels into micrometres. Conventions: see
-``torch_ecc.pose``.
+``stabilise`` warps frames back onto the first; ``batch`` tracks many recordings; ``Calibration`` turns pixels into
+micrometres. Conventions: see ``torch_ecc.pose``.
 
 Names are fetched when they are first used: ``import torch_ecc`` alone does not even bring torch.
 """
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors read; the same places as below
     from torch_ecc.body.body import Body, BodyEstimate
     from torch_ecc.body.calibrate import SelfCalibration, calibrate
+    from torch_ecc.commands.batch import Batch, batch
     from torch_ecc.core import pose
     from torch_ecc.core.align import align
     from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
@@ -33,6 +34,7 @@ __version__ = "0.1.0"
 _PLACES = {
     "body.body": ["Body", "BodyEstimate"],
     "body.calibrate": ["SelfCalibration", "calibrate"],
+    "commands.batch": ["Batch", "batch"],
     "core.pose": ["pose"],
     "core.align": ["align"],
     "core.criteria": ["ECC", "SSD", "Criterion", "PaperECC"],
@@ -51,6 +53,7 @@ _PLACES = {
 __all__ = [
     "ECC",
     "SSD",
+    "Batch",
     "Body",
     "BodyEstimate",
     "Calibration",
@@ -71,6 +74,7 @@ __all__ = [
     "Track",
     "Tracker",
     "align",
+    "batch",
     "calibrate",
     "locate",
     "pose",

@@ -15,29 +15,29 @@ from rich.progress import Task as RichTask
 from rich.text import Text
 
 import torch_ecc
-from torch_ecc.commands.jobs import Align, CompareJob, TrackJob
+from torch_ecc.commands.jobs import Align, BatchJob, CompareJob, TrackJob
 from torch_ecc.commands.options import given, options_of, read_polygons, read_scale, read_size, track_toml, write_new
 from torch_ecc.config import fill, read_toml
 
 INTERRUPTED = 130
 
-console = Console(highlight=False)
-
-TRACKING = options_of(
-    TrackJob,
-    without=("input",),
-    centers={"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
-    size={"type": str, "metavar": "N|H,W", "callback": read_size},
-    um_per_px={"type": str, "metavar": "S|SX,SY", "callback": read_scale},
-    max_step={"nargs": 2, "type": float, "metavar": "PX DEG"},
-    polygons={
+TRACK_FORMS: dict[str, dict[str, Any]] = {  # of those options of TrackJob that are no single number or word
+    "centers": {"flag": "--center", "nargs": 2, "type": float, "multiple": True, "metavar": "X Y"},
+    "size": {"type": str, "metavar": "N|H,W", "callback": read_size},
+    "um_per_px": {"type": str, "metavar": "S|SX,SY", "callback": read_scale},
+    "max_step": {"nargs": 2, "type": float, "metavar": "PX DEG"},
+    "polygons": {
         "flag": "--polygon",
         "type": str,
         "multiple": True,
         "metavar": "'X,Y X,Y ...'",
         "callback": read_polygons,
     },
-)
+}
+
+console = Console(highlight=False)
+
+TRACKING = options_of(TrackJob, without=("input",), **TRACK_FORMS)
 
 
 def _say_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
@@ -138,6 +138,35 @@ def _show(url: str, browser: bool) -> None:
     console.print("Ctrl-C ends it.")
     if browser:
         click.launch(url)
+
+
+@app.command()
+@click.argument("recordings", nargs=-1, required=True, metavar="RECORDINGS...|LIST.toml")
+@options_of(BatchJob, without=("recordings", "match"))
+@options_of(TrackJob, without=("input", "out", "force", "resume"), **TRACK_FORMS)
+def batch(recordings: tuple[str, ...], **options: Any) -> None:
+    """Track many recordings, on the cores here or on a Dask cluster; again, only what is missing or has changed.
+
+    A recording is whatever track takes but a camera: a video, a folder of images, a TIFF, an array. LIST.toml names
+    them, with settings for all and for some. Exit status 0 only if every one was tracked.
+    """
+    from torch_ecc.commands.batch import batch as run
+
+    def say(words: str) -> None:
+        console.print(words, soft_wrap=True, markup=False)
+
+    with progress_bar("batch") as advance:
+        done = run(recordings, progress=advance, say=say, **given(options))
+    failed, unfinished = done.of("failed"), done.of("unfinished")
+    for row in failed:
+        say(f"Failed: {one_line(ValueError(row['recording']))}: {one_line(ValueError(row['words']))}")
+    tracked = len(done.of("tracked"))
+    say(f"Tracked {done.tracked_now} now; {tracked} of {len(done.rows)} are done, {len(failed)} have failed")
+    say(f"In {done.folder}/: batch.csv, batch.png, and a folder for each recording")
+    if done.interrupted:
+        say(f"Stopped: {len(unfinished)} recordings are left. The same command goes on with them.")
+        sys.exit(INTERRUPTED)
+    sys.exit(1 if failed or unfinished else 0)
 
 
 @app.command()

@@ -129,6 +129,30 @@ class TrackJob(Tracking):
         return Path(f"camera-{plain}-track" if plain.isdecimal() and not given.exists() else f"{plain}-track")
 
 
+@dataclass(frozen=True, kw_only=True)
+class BatchJob:
+    """Settings of ``torch-ecc batch``, beside those of ``TrackJob`` for all recordings and, by ``match``, for those
+    whose name or path a pattern fits; where several patterns fit, the later one wins."""
+
+    recordings: tuple[str, ...]
+    out: str = described("torch-ecc-batch", "folder for the results, one in it for each recording")
+    scheduler: str | None = described(
+        None, "address of a Dask scheduler, as tcp://10.0.0.1:8786; without it, one worker per core here"
+    )
+    workers: int | None = described(None, "so many workers here, instead of one per core")
+    parts: int = described(
+        1, "cut recordings that can be gone into anywhere (images, TIFF, arrays) into this many at most; no overlays"
+    )
+    parquet: bool = described(False, "write poses.parquet, all poses of all recordings in one table")
+    retry: bool = described(False, "try those again, too, that failed before and have not changed")
+    match: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("workers", "parts"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ValueError(f"{name}: expected 1 or more, got {value}")
+
+
 @dataclass(frozen=True)
 class CompareJob:
     """Settings of ``torch-ecc compare``: the files ``track``, a track.csv, and ``sensors``, any log with times and one

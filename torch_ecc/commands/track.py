@@ -24,6 +24,7 @@ from torch_ecc.io.beside import ahead
 from torch_ecc.io.journal import Unfinished
 from torch_ecc.io.output import check_folder, claim
 from torch_ecc.io.stabilised import StabilisedWriter
+from torch_ecc.io.stacks import Stack
 from torch_ecc.io.summary import plain
 from torch_ecc.io.track import FILES
 from torch_ecc.track.tracker import Tracker
@@ -72,16 +73,17 @@ class Finished(NamedTuple):
 class Session:
     """A checked run: the input is open, the templates are cut, and nothing is written yet.
 
-    Raises FileNotFoundError or ValueError for whatever in ``job`` does not fit.
+    ``frames``: anything indexed like a stack of them, in place of a file; ``job.input`` is then only its name. Raises
+    FileNotFoundError or ValueError for whatever in ``job`` does not fit.
     """
 
-    def __init__(self, job: TrackJob) -> None:
+    def __init__(self, job: TrackJob, frames: Stack | None = None) -> None:
         self.job, self.folder = job, check_folder(job.folder(), "track")
         if not (job.force or (job.resume and Unfinished.of(self.folder))):
             refuse_overwriting(self.folder, RESULTS)
         crops = read_templates(job)
         choice = {name: getattr(job, name) for name in ("channel", "slice", "position")}
-        self.source = open_frames(job.input, fps=job.fps, **choice)
+        self.source = open_frames(job.input if frames is None else frames, fps=job.fps, **choice)
         if job.frames is not None:
             self.source = self.source[span(job.frames)]
         first = self.source.first if job.reference is None else open_frames(job.reference).first
@@ -136,9 +138,7 @@ class Session:
             try:
                 with run:
                     frames = self._frames(left)
-                    for frame in ahead(map(with_picture, frames) if films else frames):
-                        watch(frame, run.step(frame))
-                        progress(run.done)
+                    run.through(map(with_picture, frames) if films else frames, progress, watch)
             except (KeyboardInterrupt, ValueError) as error:
                 stopped = error
             except OSError as error:
@@ -149,6 +149,21 @@ class Session:
             if isinstance(stopped, ValueError):
                 raise stopped
         return Finished(*run.counts, self.folder, stopped is not None)
+
+    def run_part(self, first: int, last: int, progress: Callable[[int], None] = lambda done: None) -> None:
+        """Track the frames from number ``first`` to ``last``, or those of them that the folder does not have yet, and
+        leave them there as a run that was ended before its time: without results, to go on with."""
+        with claim(self.folder):
+            left = self._left([])
+            run = _Run(self.tracker, self._track_writer(left), [], stop_at_damage=self.job.stop_at_damage)
+            if left is not None:
+                records = left.records(self.folder)
+                run.go_on(records)
+                first = int(records["frame"][-1]) + 1
+            try:
+                run.through(self.source.between(first, last), progress)
+            finally:
+                run.track.leave()
 
     def _remove_old(self, films: set[str]) -> None:
         """What a result before had and this one does not."""
@@ -175,8 +190,7 @@ class Session:
         """Those that are not done yet."""
         if left is None:
             return iter(self.source)
-        last = int(left.records(self.folder)["frame"][-1])
-        return (frame for frame in self.source if frame.number > last)
+        return self.source.between(int(left.records(self.folder)["frame"][-1]) + 1)
 
     def _track_writer(self, left: Unfinished | None) -> TrackWriter:
         """Of track.csv, track.npz and summary.json."""
@@ -221,7 +235,7 @@ class _Run:
         self.done, self.damaged, self.reasons = 0, 0, np.zeros(len(Reason), np.int64)
         self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
         # What the next frame depends on: all of it goes into the journal with every frame.
-        self._state = [part for name, part in tracker.named_buffers() if name not in CONSTANT]
+        self._state = state_of(tracker)
         self._views = [part.numpy() for part in self._state if part.device.type == "cpu"]  # they see what is written
         for film in films:
             film.film.resumable = True
@@ -234,6 +248,17 @@ class _Run:
 
     def __exit__(self, *error: Any) -> None:
         self._open.__exit__(*error)
+
+    def through(
+        self,
+        frames: Iterable[Frame],
+        progress: Callable[[int], None],
+        watch: Callable[[Frame, Estimate], None] = lambda frame, estimate: None,
+    ) -> None:
+        """All of them; ``progress`` is told how many frames are done, ``watch`` what was found in each."""
+        for frame in ahead(frames):
+            watch(frame, self.step(frame))
+            progress(self.done)
 
     def step(self, frame: Frame) -> Estimate:
         """One frame more, and what was found in it. ValueError for one that is damaged, if that is to be the end."""
@@ -268,16 +293,25 @@ class _Run:
 
     def go_on(self, records: NDArray[Any]) -> None:
         """After the ``records`` (F,) of an unfinished run."""
-        state = np.array(records["state"][-1]).tobytes()
-        for part in self._state:
-            size = part.numel() * part.element_size()
-            value = np.frombuffer(state[:size], part.cpu().numpy().dtype).reshape(tuple(part.shape))
-            part.copy_(torch.from_numpy(value.copy()))
-            state = state[size:]
+        restore(self._state, np.array(records["state"][-1]).tobytes())
         status = np.array(records["status"])
         for film in self.films:
             film.go_on(np.array(records["pose"]), status <= Status.MAX_ITERATIONS)
         self._count(status, np.array(records["reason"]))
+
+
+def state_of(tracker: Tracker) -> list[Tensor]:
+    """The parts of a tracker that change from frame to frame, in the order in which a journal has them."""
+    return [part for name, part in tracker.named_buffers() if name not in CONSTANT]
+
+
+def restore(parts: list[Tensor], state: bytes) -> None:
+    """Write a journal's ``state`` into the parts that it is of."""
+    for part in parts:
+        size = part.numel() * part.element_size()
+        value = np.frombuffer(state[:size], part.cpu().numpy().dtype).reshape(tuple(part.shape))
+        part.copy_(torch.from_numpy(value.copy()))
+        state = state[size:]
 
 
 def with_picture(frame: Frame) -> Frame:
@@ -298,10 +332,14 @@ def _told(error: OSError, done: int) -> OSError:
 
 def settings_of(job: TrackJob, first: Tensor) -> dict[str, Any]:
     """What a result depends on, as JSON knows it: the settings that were given, and the first frame by its checksum."""
+    return given_settings(job) | {"first_frame_crc32": zlib.crc32(first.cpu().numpy().tobytes())}
+
+
+def given_settings(job: TrackJob) -> dict[str, Any]:
+    """The settings that were given, as JSON knows them, without those that change no result."""
     given = {k: v for k, v in dataclasses.asdict(job).items() if v not in (None, (), False)}
-    checksum = zlib.crc32(first.cpu().numpy().tobytes())
     found: dict[str, Any] = plain({k: v for k, v in given.items() if k not in NOT_OF_THE_RESULT})
-    return found | {"first_frame_crc32": checksum}
+    return found
 
 
 def refuse_overwriting(folder: Path, names: Iterable[str]) -> None:

@@ -7,6 +7,7 @@ grey levels of one size and kind, is decided here.
 from __future__ import annotations
 
 import sys
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -145,6 +146,20 @@ class FrameSource:
         for raw in self._medium.read(_numbers(self._medium, slice(which, which + 1 or None))):
             return self._checked(self._frame(raw))
         raise IndexError(f"{self.name} has no frame {which}")
+
+    @property
+    def numbers(self) -> range | None:
+        """Those of all frames, None where what tells their number may be wrong (a video, a camera)."""
+        return self._numbers if self._medium.exact and self.length is not None else None
+
+    def between(self, first: int, last: int | None = None) -> Iterator[Frame]:
+        """The frames from number ``first`` to ``last``, both included; all the others from there on without one."""
+        if self.length is None:  # a camera does not begin again
+            yield from (frame for frame in self if frame.number >= first)
+            return
+        stop = None if last is None else bisect_right(self._numbers, last)
+        for raw in self._medium.read(self._numbers[bisect_left(self._numbers, first) : stop]):
+            yield self._checked(self._frame(raw))
 
     def _frame(self, raw: Raw) -> Frame:
         """What a raw frame is by itself."""

@@ -78,7 +78,7 @@ class Unfinished(NamedTuple):
             raise ValueError(f"resume: {path} was written by another version of torch_ecc; --force starts anew")
         start = _HEADER + length
         whole = (path.stat().st_size - start) // form.dtype.itemsize
-        frames = min(whole, (_lines(_rows(folder)) - 1) // form.templates)
+        frames = min(whole, (_lines(rows_file(folder)) - 1) // form.templates)
         return Unfinished(settings, form, start, frames) if frames > 0 else None
 
     def records(self, folder: Path) -> NDArray[Any]:
@@ -116,9 +116,11 @@ class Journal:
     def go_on(folder: Path, left: Unfinished) -> Journal:
         """With the files of a run before, after the frames that are ``left``."""
         path = part(folder, _TABLE)
-        if _rows(folder) != path:  # it was ended in order: its table has its name already, and keeps it until the end
+        if (
+            rows_file(folder) != path
+        ):  # it was ended in order: its table has its name already, and keeps it until the end
             path.unlink(missing_ok=True)
-            shutil.copyfile(_rows(folder), path)
+            shutil.copyfile(rows_file(folder), path)
         with path.open("rb") as file:
             size = sum(map(len, islice(file, 1 + left.frames * left.form.templates)))
         whole = left.start + left.frames * left.form.dtype.itemsize
@@ -147,6 +149,12 @@ class Journal:
         # A frame counts from here on: what an interrupt leaves half-written behind these marks is cut off by close().
         self.frames, self.table_bytes = self.frames + 1, self.table_bytes + len(text)
 
+    def extend(self, records: NDArray[Any], rows: bytes) -> None:
+        """Frames more, as another journal of this form has them."""
+        append(self.records_file, records.tobytes())
+        append(self.table_file, rows)
+        self.frames, self.table_bytes = self.frames + len(records), self.table_bytes + len(rows)
+
     def close(self) -> bool:
         """Cut both files after the last whole frame; False, and no files, if there is none."""
         size = self.start + self.frames * self._dtype.itemsize
@@ -166,7 +174,7 @@ class Journal:
         part(self.folder, _RECORDS).unlink()
 
 
-def _rows(folder: Path) -> Path:
+def rows_file(folder: Path) -> Path:
     """The table of an unfinished run: with its final name if it was ended in order."""
     path = part(folder, _TABLE)
     return path if path.exists() else folder / _TABLE

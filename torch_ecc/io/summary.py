@@ -31,7 +31,7 @@ def summarise(
         "rows": records["score"].size,
         "reasons": _counted(records["reason"], reasons),
         "per_template": [_summarise_template(records, names, reasons, index) for index in range(templates)],
-        "versions": _versions(),
+        "versions": versions(),
     }
 
 
@@ -78,7 +78,8 @@ def _describe(error: BaseException | None) -> str | None:
     return f"{type(error).__name__}: {error}"
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Of what a result depends on."""
     try:
         package = version("torch-ecc")
     except PackageNotFoundError:

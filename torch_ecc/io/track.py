@@ -109,6 +109,12 @@ class TrackWriter:
                     part(self.out_dir, name).unlink(missing_ok=True)
             raise
 
+    def leave(self) -> None:
+        """End without results: what a later run can go on with stays."""
+        journal, self._journal = self._journal, None
+        if journal is not None:
+            journal.close()
+
     def _finish(self, journal: Journal, error: BaseException | None) -> None:
         seconds = time.perf_counter() - self._started
         records = journal.records()

@@ -1,0 +1,126 @@
+"""Calls handed out to a Dask cluster, a few more than there are workers at a time, until every one has come back.
+
+A scheduler's memory does not grow with the number of calls, and whatever is lost, a worker or the scheduler itself, is
+handed out again: to do the same twice does no harm.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from asyncio import CancelledError
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from torch_ecc.commands.batch_cluster import GPU
+from torch_ecc.commands.batch_unit import FAILED, UNFINISHED, Row, Work, row_of
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+TRIES = 5  # of a call that a worker gives up because it does not see that somebody waits for it
+LOOK = 5.0  # s after which workers are counted again
+ENDING = 15.0  # s for workers to notice that nobody waits for them
+
+
+class SchedulerGoneError(Exception):
+    """The connection was lost; what was handed out is to be handed out again."""
+
+
+@dataclass(eq=False)
+class Task:
+    """A call ``make(work, *rest)`` for a worker. ``then`` is another one that ``waits`` for it and for others."""
+
+    key: str
+    make: Callable[..., Row]
+    work: Work
+    rest: tuple[Any, ...] = ()
+    then: Task | None = None
+    waits: int = 0
+    tries: int = 0
+
+
+class Queue:
+    """The ``tasks``, made one by one when there is a worker for them; ``came`` is told of every row."""
+
+    def __init__(self, tasks: Iterable[Task], came: Callable[[Row], None], *, gpu: bool = False) -> None:
+        self._tasks, self._came = iter(tasks), came
+        self._resources = {GPU: 1} if gpu else None
+        self._again: deque[Task] = deque()  # what was lost, or has become possible
+        self._out: dict[Future, Task] = {}
+        self._most, self._look = 0, 0.0
+
+    def run(self, client: Client, withdraw: Callable[[], object]) -> None:
+        """Until all have come back. SchedulerGoneError if the connection is lost: another call goes on with another
+        client. A KeyboardInterrupt calls ``withdraw``, waits for the workers to notice, and is raised again."""
+        from distributed import as_completed
+
+        back, self._look = as_completed(loop=client.loop), 0.0
+        try:
+            while self._hand_out(client, back):
+                self._settle(next(back))
+        except KeyboardInterrupt:
+            withdraw()
+            self._wind_up()
+            raise
+        except (OSError, RuntimeError, CancelledError) as error:  # what Dask says before it knows that nobody is there
+            if isinstance(error, RuntimeError) and client.status == "running":
+                raise
+            self._again.extend(self._out.values())
+            self._out.clear()
+            raise SchedulerGoneError from error
+
+    def _hand_out(self, client: Client, back: Any) -> int:
+        """As many as are wanted; how many are out then."""
+        if time.monotonic() > self._look:
+            self._look = time.monotonic() + LOOK
+            self._most = 2 * max(sum(client.nthreads().values()), 1)
+        while len(self._out) < self._most:
+            task = self._again.popleft() if self._again else next(self._tasks, None)
+            if task is None:
+                break
+            # A scheduler remembers every group of keys that it has seen: all of ours are of one.
+            name = (f"torch_ecc.{task.make.__name__}", task.key, secrets.token_hex(4))
+            future = client.submit(task.make, task.work, *task.rest, key=name, pure=False, resources=self._resources)
+            self._out[future] = task
+            back.add(future)
+        return len(self._out)
+
+    def _settle(self, future: Future) -> None:
+        """One has come back, or is lost."""
+        if future.status not in ("finished", "error"):
+            raise ConnectionError(f"{self._out[future].key} is lost")
+        task = self._out.pop(future)
+        row = self._row(task, future)
+        if row["status"] == UNFINISHED and task.tries < TRIES:
+            task.tries += 1
+            time.sleep(0.2)
+            self._again.append(task)
+        elif task.then is None or row["status"] == FAILED:
+            self._came(row)
+        else:
+            task.then.waits -= 1
+            if not task.then.waits:
+                self._again.appendleft(task.then)
+
+    def _row(self, task: Task, future: Future) -> Row:
+        if future.status == "finished":
+            return future.result()  # type: ignore[no-any-return]
+        from distributed import KilledWorker
+
+        error = future.exception()
+        words = f"{type(error).__name__}: {error}"
+        if isinstance(error, KilledWorker):
+            words = f"it ended its worker {error.allowed_failures + 1} times"
+        return row_of(task.work, FAILED, words=words)
+
+    def _wind_up(self) -> None:
+        """Rows that still come when nobody waits any more."""
+        deadline = time.monotonic() + ENDING
+        while time.monotonic() < deadline and not all(future.done() for future in self._out):
+            time.sleep(0.05)
+        for future, task in self._out.items():
+            if future.status == "finished" and task.then is None and future.result()["status"] != UNFINISHED:
+                self._came(future.result())
