@@ -241,7 +241,7 @@ def test_a_lost_patch_is_looked_for_where_its_body_says():
     frames = Camera(size=(360, 360), noise_sigma=2.0).capture(scene, path)[:, 0]
     frames[3:13, 60:200, 60:160] = 128  # over patch 0 and its way
     for guided in (False, True):
-        tracker = Tracker(frames[0], centers, 41, search=False)
+        tracker = Tracker(frames[0], centers, 41, prediction="hold", search=False)
         body = Body(tracker)
         found = []
         for frame in frames[1:]:

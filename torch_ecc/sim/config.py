@@ -146,7 +146,7 @@ def read_camera(values: Any, light: Light | None, folder: Path) -> Camera:
         settings["noise_sigma"] = noise_sigma(variance)
     if settings.get("bits") == "float":
         settings["bits"] = None
-    return fill(Camera, settings, "[camera]", folder=folder, light=light)
+    return fill(Camera, settings, "[camera]", folder=folder, light=light, lens=None)
 
 
 def _motion(values: Any, size: tuple[int, int], folder: Path) -> Tensor:
