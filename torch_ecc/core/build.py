@@ -60,7 +60,11 @@ X86 = {
     "AVX2": ["-mavx2", "-mfma"],
     "AVX512": ["-mavx512f", "-mavx512vl", "-mavx512bw", "-mavx512dq", "-mavx2", "-mfma"],
 }
-ZIG_X86 = {"baseline": [], "AVX2": ["-mcpu=x86_64_v3"], "AVX512": ["-mcpu=x86_64_v4"]}
+ZIG_X86 = {
+    "baseline": [],
+    "AVX2": ["-mcpu=x86_64_v3"],
+    "AVX512": ["-mcpu=x86_64_v4", "-mprefer-vector-width=512"],
+}
 ARM: Mapping[str, list[str]] = {"baseline": []}  # NEON
 ELF = ["-fPIC", "-pthread", f"-Wl,--version-script={SOURCES / 'exports.map'}", "-Wl,-s"]
 TARGETS = {  # of wheels, built by zig; Linux as old as manylinux2014
@@ -138,7 +142,7 @@ def build(folder: Path, target: Target) -> list[Path]:
 def _placed(target: Target, kind: str, values: Mapping[str, float], scratch: Path) -> Path:
     """The library for one ``kind`` of instructions, in the folder above its ``scratch``."""
     made, folder = scratch / f"{kind}{target.suffix}", scratch.parent
-    zig = [sys.executable, "-m", "ziglang", "c++", "-target", target.zig]
+    zig = [sys.executable, "-m", "ziglang", "c++", "-target", target.zig, "-Xclang", "-O3"]  # of itself it takes -O2
     command = zig if target.zig else compiler()
     command += [*FLAGS, *(f"-D{name}={value!r}" for name, value in values.items()), *target.instructions[kind]]
     run([*command, str(SOURCES / "engine.cpp"), "-o", str(made), *target.linking], made)
