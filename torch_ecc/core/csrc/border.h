@@ -124,10 +124,10 @@ inline bool weigh(const Template& t, const Pixels& p, const Warp& warp, const Fr
   b.seen.assign(p.height * p.pitch, 0);
   float any = 0;
   for (int64_t j = 0; j < p.height; ++j) {
-    const double py = p.n->top + double(j) * p.step, y0 = warp.y0 + warp.c * py, x0 = warp.x0 + warp.s * py;
+    const double u = p.n->left, v = p.n->top + double(j) * p.step;
     double first = 0, last = double(p.width - 1);  // a row's visible pixels, all of which lie side by side
-    clip(x0 + warp.c * p.n->left, warp.c * p.step, double(frame.w - 1), first, last);
-    clip(y0 - warp.s * p.n->left, -warp.s * p.step, double(frame.h - 1), first, last);
+    clip(warp.x(u, v), warp.xu * p.step, double(frame.w - 1), first, last);
+    clip(warp.y(u, v), warp.yu * p.step, double(frame.h - 1), first, last);
     const float* const of = p.weights.at + j * p.weights.pitch;
     if (!(first <= last)) continue;
     for (int64_t i = int64_t(first); i <= int64_t(last); ++i) {

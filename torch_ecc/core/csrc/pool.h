@@ -1,11 +1,9 @@
 // Threads that sleep until there is work. The caller works too and waits for none that has not begun: where something
 // else keeps a core busy, it does all by itself.
 #pragma once
-#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <cstdint>
-#include <deque>
 #include <exception>
 #include <functional>
 #include <mutex>
@@ -22,7 +20,6 @@ struct Job {  // tasks 0 to count - 1; each thread takes the next one: they are 
   const std::function<void(int64_t)>& task;
   std::atomic<int64_t> next{0};
   std::atomic<bool> failed{false};
-  int64_t wanted = 0, working = 0;  // threads that may still come, and that are at it
 
   void work() {
     try {
@@ -37,37 +34,39 @@ struct Job {  // tasks 0 to count - 1; each thread takes the next one: they are 
 struct Pool {
   std::mutex mutex;
   std::condition_variable wake, done;
-  std::deque<Job*> jobs;
-  int64_t threads = 0;
+  Job* job = nullptr;                            // the one that is shared: who comes meanwhile works alone
+  int64_t threads = 0, wanted = 0, working = 0;  // all there are; those that may still come to it, and are at it
 
-  void run(Job& job, int64_t helpers) {
-    {
-      std::lock_guard lock(mutex);
+  void share(Job& shared, int64_t helpers) {
+    std::unique_lock lock(mutex);
+    const bool alone = job;
+    if (!alone) {
       try {
         for (; threads < helpers; ++threads) std::thread([this] { serve(); }).detach();
-      } catch (const std::system_error&) {  // there are no more of them
-        helpers = threads;
+      } catch (const std::system_error&) {  // there can be no more of them
       }
-      job.wanted = helpers;
-      if (helpers) jobs.push_back(&job);
+      job = &shared;
+      wanted = std::min(helpers, threads);
     }
-    for (int64_t k = 0; k < helpers; ++k) wake.notify_one();
-    job.work();
-    std::unique_lock lock(mutex);
-    if (job.wanted) jobs.erase(std::find(jobs.begin(), jobs.end(), &job));
-    done.wait(lock, [&] { return job.working == 0; });
+    lock.unlock();
+    for (int64_t k = 0; !alone && k < helpers; ++k) wake.notify_one();
+    shared.work();
+    if (alone) return;
+    lock.lock();
+    wanted = 0;
+    done.wait(lock, [&] { return working == 0; });
+    job = nullptr;
   }
 
   void serve() {
     for (std::unique_lock lock(mutex);;) {
-      wake.wait(lock, [&] { return !jobs.empty(); });
-      Job& job = *jobs.front();
-      if (--job.wanted == 0) jobs.pop_front();
-      ++job.working;
+      wake.wait(lock, [&] { return wanted > 0; });
+      --wanted;
+      ++working;
       lock.unlock();
-      job.work();
+      job->work();
       lock.lock();
-      if (--job.working == 0) done.notify_all();
+      if (--working == 0) done.notify_one();
     }
   }
 };
@@ -86,9 +85,8 @@ inline Pool*& pool() {
 // task(0) to task(count - 1) on as many threads, this one among them. False if one of them has failed.
 inline bool share(int64_t count, int64_t threads, const std::function<void(int64_t)>& task) {
   Job job{count, task};
-  const int64_t helpers = std::min(count, threads) - 1;
-  if (helpers > 0)
-    pool()->run(job, helpers);
+  if (threads > 1 && count > 1)
+    pool()->share(job, std::min(count, threads) - 1);
   else
     job.work();
   return !job.failed;

@@ -4,8 +4,11 @@
 
 namespace ecc {
 
-struct Warp {  // template pixel (x', y') to the frame: x = c x' + s y' + x0, y = -s x' + c y' + y0 (eq. 2)
-  double c, s, x0, y0;
+struct Warp {  // of a template's pixel (u, v) to the frame, x = xu u + xv v + x0 and y = yu u + yv v + y0
+  double xu, xv, yu, yv, x0, y0;
+
+  double x(double u, double v) const { return xu * u + xv * v + x0; }
+  double y(double u, double v) const { return yv * v + yu * u + y0; }
 };
 
 struct Line {  // n points x + k dx, y + k dy; (0, 0) is where the first tap of a point is the window's first value

@@ -30,8 +30,11 @@ struct Scratch {  // of one thread, kept from call to call
   Weights seen(const Pixels& p) const { return partial ? Weights{border.seen.data(), p.pitch} : p.weights; }
 };
 
-// Of pixel positions relative to the template's centre.
-inline Warp warp_of(const double (&pose)[3]) { return {std::cos(pose[2]), std::sin(pose[2]), pose[0], pose[1]}; }
+// Of pixel positions relative to the template's centre: eq. 2. Here alone it is a rotation.
+inline Warp warp_of(const double (&pose)[3]) {
+  const double c = std::cos(pose[2]), s = std::sin(pose[2]);
+  return {c, s, -s, c, pose[0], pose[1]};
+}
 
 // Smallest rectangle around the warped template.
 inline void bounds(const Pixels& p, const Warp& w, double (&low)[2], double (&high)[2]) {
@@ -40,7 +43,7 @@ inline void bounds(const Pixels& p, const Warp& w, double (&low)[2], double (&hi
   for (int k = 0; k < 4; ++k) {
     const double x = p.n->left + (k % 2 ? double(p.width - 1) * p.step : 0);
     const double y = p.n->top + (k / 2 ? double(p.height - 1) * p.step : 0);
-    const double point[2] = {w.c * x + w.s * y + w.x0, w.c * y - w.s * x + w.y0};
+    const double point[2] = {w.x(x, y), w.y(x, y)};
     for (int d = 0; d < 2; ++d) {
       low[d] = std::min(low[d], point[d]);
       high[d] = std::max(high[d], point[d]);
@@ -72,18 +75,17 @@ bool find(const Template& t, const Pixels& p, const Frame& frame, const Warp& wa
 template <int degree>
 void look(const Template& t, const Pixels& p, const Warp& warp, Scratch& scratch) {
   const Window& window = scratch.window;
-  const double x0 = warp.x0 - double(window.x0 + degree / 2), y0 = warp.y0 - double(window.y0 + degree / 2);
+  Warp there = warp;
+  there.x0 -= double(window.x0 + degree / 2), there.y0 -= double(window.y0 + degree / 2);
   scratch.model = {};
   Model& m = scratch.model;
   for (int64_t first = 0; first < p.height; first += BAND) {
     const int64_t rows = std::min(BAND, p.height - first);
     float* const band = scratch.patch.data() + first * p.pitch;
     for (int64_t j = 0; j < rows; ++j) {
-      const double y = p.n->top + double(first + j) * p.step;
-      sample<degree>(window,
-                     {float(warp.c * p.n->left + warp.s * y + x0), float(warp.c * y - warp.s * p.n->left + y0),
-                      float(warp.c * p.step), float(-warp.s * p.step), int(p.width)},
-                     band + j * p.pitch);
+      const double u = p.n->left, v = p.n->top + double(first + j) * p.step;
+      const Line line{float(there.x(u, v)), float(there.y(u, v)), float(there.xu * p.step), float(there.yu * p.step), int(p.width)};
+      sample<degree>(window, line, band + j * p.pitch);
       fetch(p, first + BAND + j, degree == 1 ? 3 : 6);
     }
     if (first == 0) m.base = band[p.width / 2];  // sums lose little where little is left
