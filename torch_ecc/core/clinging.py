@@ -142,6 +142,6 @@ def _lines(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, ...]:
     rows, columns = (torch.eye(n, dtype=torch.float32, device=device) for n in grid)
     member = torch.cat((rows.repeat_interleave(grid[1], 0), columns.repeat(grid[0], 1)), 1)
     kind = torch.eye(2, dtype=torch.float32, device=device).repeat_interleave(torch.tensor(grid, device=device), 0)
-    sure, free = ([f(n) for n in grid] for f in (lambda n: 1 + SURE * (2 / n) ** 0.5, lambda n: n / max(n - 3, 1)))
+    sure, free = [1 + SURE * (2 / n) ** 0.5 for n in grid], [n / max(n - 3, 1) for n in grid]
     numbers = torch.tensor([sure, free], dtype=torch.float32, device=device)
     return member, kind, numbers[0], numbers[1]
