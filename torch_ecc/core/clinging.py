@@ -23,7 +23,7 @@ from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.solution import Solution
 
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
-SURE = 2.5  # standard deviations by which lines must scatter more than blocks do: lines are few, and scatter by chance
+SURE = 3.0  # standard deviations by which lines must scatter more than blocks do: lines are few, and scatter by chance
 LEAST_SPREAD = 0.2  # of the mean: blocks that tell next to nothing count by what they tell
 BY_CHANCE = 14.0  # so large may the square of 7 strains over its variance be by chance
 
@@ -65,10 +65,9 @@ def clinging(reference: Reference, found: Solution, variance: Tensor, of_both: T
 def in_lines(effect: Tensor, white: Tensor, scatter: Tensor, grid: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Scatter (B, 3, 2) as of rows and of columns of blocks with an ``effect`` (B, 3, blocks), and whether it is for
     certain more than the ``scatter`` (B, 3) of blocks."""
-    member, free, sure = _lines(grid, effect.device)
-    squares = torch.matmul(effect, member).square_()
-    lines = torch.matmul(squares, free).to(white.dtype).div_(white.unsqueeze(2))
-    return lines, lines > sure * scatter.unsqueeze(2)
+    member, kind, sure, free = _lines(grid, effect.device)
+    lines = torch.matmul(torch.matmul(effect, member).square_(), kind).div(white.unsqueeze(2))
+    return lines * free, lines > sure * scatter.unsqueeze(2)
 
 
 def without_strain(parts: Parts, found: Solution) -> tuple[Tensor, Tensor]:
@@ -132,22 +131,17 @@ def _turning(device: torch.device) -> Tensor:
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _lines(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Of a grid of blocks: which they are in, (blocks, rows + columns); what the squares of lines count,
-    (rows + columns, 2); and how many times that of blocks their scatter is for certain, (2,).
+def _lines(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, ...]:
+    """Of a grid of blocks: which rows and columns they are in, (blocks, rows + columns); which of these are rows, and
+    which columns, (rows + columns, 2); how many times that of blocks their scatter is for certain, (2,); and what makes
+    up for so few, (2,).
 
     The fit has made the sum of n lines zero, and an error over a scatter of so few has Student's distribution, with the
     variance (n - 1) / (n - 3).
     """
-    rows, columns = grid
-    member = torch.cat(
-        (
-            torch.eye(rows, dtype=torch.float32, device=device).repeat_interleave(columns, 0),
-            torch.eye(columns, dtype=torch.float32, device=device).repeat(rows, 1),
-        ),
-        1,
-    )
-    free = torch.zeros(rows + columns, 2, dtype=torch.float32, device=device)
-    free[:rows, 0], free[rows:, 1] = (n / max(n - 3, 1) for n in grid)
-    count = torch.tensor([float(n) for n in grid], dtype=torch.float32, device=device)
-    return member, free, 1 + SURE * (2 / count).sqrt()
+    rows, columns = (torch.eye(n, dtype=torch.float32, device=device) for n in grid)
+    member = torch.cat((rows.repeat_interleave(grid[1], 0), columns.repeat(grid[0], 1)), 1)
+    kind = torch.eye(2, dtype=torch.float32, device=device).repeat_interleave(torch.tensor(grid, device=device), 0)
+    sure, free = [1 + SURE * (2 / n) ** 0.5 for n in grid], [n / max(n - 3, 1) for n in grid]
+    numbers = torch.tensor([sure, free], dtype=torch.float32, device=device)
+    return member, kind, numbers[0], numbers[1]
