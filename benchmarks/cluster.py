@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,10 @@ from rich.console import Console
 
 import torch_ecc as te
 from torch_ecc.commands.batch_queue import Queue, Task
+from torch_ecc.commands.batch_unit import TICKET, WORK, Work, do
 from torch_ecc.commands.jobs import TrackJob
 from torch_ecc.commands.track import Session
+from torch_ecc.io.summary import versions
 from torch_ecc.sim.scene.waves import PlaneWaves
 
 console = Console(width=120, highlight=False)
@@ -149,33 +152,53 @@ def archive(count: int, frames: int) -> None:
 
 
 @app.command()
-@click.option("--count", default=8, help="Recordings for each worker count.")
+@click.option("--count", default=8, help="Recordings for each number of workers.")
 @click.option("--frames", default=1000)
-def speed(count: int, frames: int) -> None:
-    """Two workers beside one, from the first row to the last; and what a recording costs beside its tracking."""
+@click.option("--rounds", default=5, help="Of a recording by itself and as one of many, in turn.")
+def speed(count: int, frames: int, rounds: int) -> None:
+    """Two workers beside one, from the first word to the last; and what a recording costs beside its tracking."""
     with scratch() as folder:
-        stack, elapsed = film(0, frames), {}
+        stack = film(0, frames)
         for k in range(count):
             np.save(folder / f"{k}.npy", stack)
+        beside(folder, rounds)
+        elapsed = {}
         for workers in (1, 2):
-            came: list[float] = []
-            done = te.batch(
+            heard: list[float] = []
+            te.batch(
                 f"{folder}/*.npy",
                 folder / f"out{workers}",
                 workers=workers,
-                progress=lambda done, of, came=came: came.append(time.perf_counter()),
+                progress=lambda done, of, heard=heard: heard.append(time.perf_counter()),
                 **SETTINGS,
             )
-            elapsed[workers] = came[-1] - came[0]
-            walls = [row["wall_s"] for row in done.rows]
-            lost = elapsed[workers] * workers - sum(walls)
-            console.print(
-                f"{workers} worker(s): {elapsed[workers]:.1f} s from first to last word, tracking {sum(walls):.1f} s, "
-                f"beside it {1e3 * lost / count:.0f} ms per recording ({100 * lost / sum(walls):.1f} %)"
-            )
-        console.print(
-            f"two beside one: {elapsed[1] / elapsed[2]:.2f}; cores: {os.cpu_count()}, load {os.getloadavg()[0]:.1f}"
-        )
+            elapsed[workers] = heard[-1] - heard[0]
+            console.print(f"{workers} worker(s): {elapsed[workers]:.1f} s for {count} recordings of {frames} frames")
+        ratio, load = elapsed[1] / elapsed[2], os.getloadavg()[0]
+        console.print(f"two beside one: {ratio:.2f}; {os.cpu_count()} cores, load {load:.1f}")
+
+
+def beside(folder: Path, rounds: int) -> None:
+    """Processor time of a recording as a worker does it, and by itself, in turn and in one process."""
+    out: Path = folder / "beside"
+    times: dict[str, list[float]] = {"by itself": [], "of many": []}
+    (out / WORK).mkdir(parents=True)
+    (out / WORK / TICKET).write_text("ours")
+    job = TrackJob(input=str(folder / "0.npy"), centers=(CENTER,), size=TEMPLATE)
+    for k in range(rounds):
+        before = time.process_time()
+        Session(replace(job, out=str(out / f"alone{k}"))).run()
+        times["by itself"].append(time.process_time() - before)
+        before = time.process_time()
+        row = do(Work(f"work{k}", job, out, "ours", versions()))
+        times["of many"].append(time.process_time() - before)
+        if row["status"] != "tracked":
+            raise RuntimeError(row)
+    middle = {name: sorted(each)[rounds // 2] for name, each in times.items()}
+    least = {name: min(each) for name, each in times.items()}
+    for name, told in (("median", middle), ("least", least)):
+        more = told["of many"] / told["by itself"] - 1
+        console.print(f"processor time of a recording, {name}: {told} s, {100 * more:+.1f} %")
 
 
 def stub(number: int) -> dict[str, Any]:

@@ -110,8 +110,9 @@ def test_each_is_done_as_by_itself_and_only_once(archive, tmp_path, client, monk
     assert statuses(done) == dict.fromkeys(("lost", "pages", "pictures"), "tracked") | {"broken": "failed"}
     assert done.tracked_now == 3
     assert "cannot be read as TIFF" in done.of("failed")[0]["words"]
-    for name in ("lost.npy", "pages.tif", "pictures"):
+    for name in ("lost.npy", "pictures"):
         assert_as_by_itself(out / Path(name).stem, archive / name, tmp_path / "alone" / name)
+    monkeypatch.setattr(Session, "_plot", lambda self: None)
     rows = {row["folder"]: row for row in csv.DictReader((out / "batch.csv").open())}
     assert [rows["lost"][name] for name in ("frames", "lost", "damaged")] == ["8", "3", "0"]
     with np.load(out / "pages" / "track.npz") as track:
@@ -282,6 +283,18 @@ def test_a_seam_that_does_not_fit_is_tracked_through(long, monkeypatch):
         assert (joined / name).read_bytes() == (long / "whole" / name).read_bytes()
 
 
+def test_a_part_that_begins_without_its_target_is_tracked_through(long, tmp_path, monkeypatch):
+    frames = np.load(long / "long.npy")
+    frames[75:85] = 90  # across a seam
+    (tmp_path / "lost").mkdir()
+    np.save(tmp_path / "lost" / "long.npy", frames)
+    joined, seams = in_parts(tmp_path / "lost", monkeypatch)
+    assert [seam["tracked_through"] for seam in seams] == [False, True, False]
+    with np.load(joined / "track.npz") as track:
+        assert np.isnan(track["pose"][75:85]).all()
+        assert np.isfinite(track["pose"][86:]).all()
+
+
 def test_short_ones_and_videos_are_not_cut(one, tmp_path):
     assert cut(work(one, tmp_path), 4) == []
 
@@ -307,12 +320,12 @@ def test_a_batch_in_parts(long, tmp_path, client, monkeypatch):
 def test_a_list_names_recordings_and_their_settings(archive):
     (archive / "list.toml").write_text(
         'recordings = ["*.npy", "pictures"]\nout = "results"\nsize = 31\ncenters = [[48, 40]]\n'
-        '[match."lost*"]\ntemplate = ["crop.png"]\nsize = 21\n[match."*/pictures"]\nfps = 9.0\n'
+        '[match."lost*"]\ntemplate = ["crop.png"]\n[match."*/pictures"]\nfps = 9.0\n'
     )
     job, found = read_list([str(archive / "list.toml")], {"levels": 2})
     assert job.out == str(archive / "results")
     assert [each.name for each in found] == ["lost", "pictures"]
-    assert [each.job.size for each in found] == [21, 31]
+    assert [each.job.size for each in found] == [None, 31]  # a template tells its size
     assert [each.job.fps for each in found] == [None, 9.0]
     assert found[0].job.template == (str(archive / "crop.png"),)
     assert {each.job.levels for each in found} == {2}

@@ -20,6 +20,8 @@ Recordings: TypeAlias = str | Path | Iterable[str | Path] | Mapping[str, Stack]
 
 NOT_HERE = ("out", "force", "resume", "input")  # of TrackJob: each recording has its own
 FILES = ("reference", "frame_mask")  # settings that name one
+PATCHES = {"centers", "size", "polygons", "grid", "reference", "template"}  # what says which patches to follow
+WAYS = {"polygons", "grid", "template"}
 LONGEST = 100  # letters of a folder's name
 
 
@@ -107,10 +109,17 @@ def _jobs(paths: list[str], values: Mapping[str, Any], job: BatchJob, where: str
         if fitting not in checked:
             own = dict(values)
             for pattern in fitting:
-                own |= job.match[pattern]
+                own = _replaced(own, job.match[pattern])
             checked[fitting] = _job(path, own, f"{where}, {Path(path).name}")
         jobs[path] = checked[fitting]
     return jobs
+
+
+def _replaced(own: dict[str, Any], table: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with those of a ``table``: one that says in another way which patches to follow says it alone."""
+    if WAYS & table.keys() or ("size" in table and own.get("template")):
+        own = {name: value for name, value in own.items() if name not in PATCHES}
+    return own | dict(table)
 
 
 def _job(path: str, own: dict[str, Any], where: str) -> TrackJob:
