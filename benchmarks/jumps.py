@@ -50,7 +50,7 @@ class WholeFrame(Tracker):
 
     def _use(self, references: list[Reference]) -> None:
         super()._use(references)
-        self._recovery = Nowhere(references[0], self.settings, self.turn, self.max_step)
+        self._recovery = Nowhere(self.references[0], self.settings, self._recovery.budget, self.max_step)
 
 
 def jump(scene: Scene, spread: tuple[float, float], seed: int, length: float, turn: float) -> Tensor:

@@ -454,8 +454,8 @@ def test_many_lost_templates_come_in_turn(monkeypatch):
     searched: list[int] = []
     monkeypatch.setattr(Recovery, "search_anywhere", lambda self, images, found, last, r: searched.append(r) or found)
     tracker(torch.full_like(frames, 90))
-    assert len(searched) == 8
-    for _ in range(3):
+    assert len(searched) == 4
+    for _ in range(5):
         tracker(torch.full_like(frames, 90))
     assert set(searched) == set(range(20))
 

@@ -210,12 +210,11 @@ def test_the_common_motion_is_that_of_most():
 def test_few_or_scattered_leaps_tell_nothing_of_the_others():
     frames = still((0, 0, 0), (1, 0, 0))
     estimate = Tracker(frames[0], [(60.0 + 20 * k, 120.0) for k in range(8)], 41)(frames[1])
-    start, found = estimate.pose - torch.tensor([9.0, 9.0, 0.0]), torch.arange(8) < 2
-    leapt = estimate._replace(origin=found.to(torch.int8))
-    assert gone_together(leapt, start) is None  # two of them
-    scattered = estimate._replace(origin=estimate.origin + 1, pose=estimate.pose * torch.arange(8)[:, None])
-    assert gone_together(scattered, start) is None
-    together = gone_together(estimate._replace(origin=estimate.origin + 1), start)
+    start, all_ = estimate.pose - torch.tensor([9.0, 9.0, 0.0]), torch.ones(8, dtype=torch.bool)
+    assert gone_together(estimate, start, torch.arange(8) < 2) is None  # two of them
+    scattered = estimate._replace(pose=estimate.pose * torch.arange(8)[:, None])
+    assert gone_together(scattered, start, all_) is None
+    together = gone_together(estimate, start, all_)
     assert (together - estimate.pose).abs().max() < 1e-9
 
 
@@ -312,3 +311,41 @@ def test_the_largest_step_tells_equal_parts_apart():
 def test_a_largest_step_is_two_numbers(step):
     with pytest.raises(ValueError, match=r"max_step: expected \(px, deg\) per frame, both > 0, got"):
         Tracker(still((0, 0, 0))[0], [(160.0, 120.0)], 61, max_step=step)
+
+
+def test_what_is_lost_is_found_where_all_others_are(monkeypatch):
+    """One of five is nowhere near where it was last: the others tell where it is, and nothing is searched for."""
+    monkeypatch.setattr(Recovery, "due", lambda *_: [])
+    stack = still((0, 0, 0), (3, 2, 1), (5, 3, 2))
+    tracker = Tracker(stack[0], [(160.0 + x, 120.0 + y) for x, y in ((0, 0), (50, 0), (0, 50), (-50, 0), (0, -50))], 41)
+    tracker(stack[1])
+    tracker.pose = tracker.pose + torch.tensor([[70.0, 40.0, 1.0], *[[0.0, 0.0, 0.0]] * 4])
+    estimate = tracker(stack[2])
+    assert (estimate.status == Status.CONVERGED).all()
+    assert estimate.origin.tolist() == [Origin.NEARBY, *[Origin.TRACKED] * 4]
+    motion = common_motion(tracker.start[1:], estimate.pose[1:])[None]
+    assert (compose(motion, tracker.start[:1]) - estimate.pose[:1]).abs().max() < 0.1
+
+
+def test_searches_take_no_more_than_their_share(monkeypatch):
+    """A template that never comes back: of the first searches all are made, and later as many as the frames pay for;
+    without a bound as often as ever. Who waits is told why."""
+    searched: list[int] = []
+    monkeypatch.setattr(
+        Recovery, "search_anywhere", lambda self, i, e, p, r: (searched.append(r), self.budget.spend(10**7), e)[2]
+    )
+    stack = still((0, 0, 0), start=(160.0, 120.0, 0.0))
+    counts = {}
+    for share in (0.1, 0.5, 1.0):
+        searched.clear()
+        tracker = Tracker(stack[0], [(160.0, 120.0)], 31, search_share=share)
+        reasons = [int(tracker(torch.full_like(stack[0], 90)).reason) for _ in range(300)]
+        counts[share] = len(searched)
+        assert (te.Reason.WAITING in reasons) == (share < 1)
+    assert counts[0.1] < counts[0.5] < counts[1.0]
+
+
+@pytest.mark.parametrize("share", [0, 1.5, -1.0, "half", float("nan")])
+def test_a_share_of_the_time_is_a_number(share):
+    with pytest.raises(ValueError, match="search_share: expected a share of the time > 0 and at most 1, got"):
+        Tracker(still((0, 0, 0))[0], [(160.0, 120.0)], 61, search_share=share)

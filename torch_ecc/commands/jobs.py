@@ -12,6 +12,7 @@ from typing import Any
 from torch_ecc.core.criteria import CRITERIA, ILLUMINATION
 from torch_ecc.core.settings import Settings, described
 from torch_ecc.records.calibration import Calibration
+from torch_ecc.track.budget import income
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.tracker import PREDICTIONS
 
@@ -30,6 +31,7 @@ class Tracking(Settings):
         "velocity", "start where the last frame ended (hold) or where its step leads", PREDICTIONS
     )
     search: bool = described(True, "look for a lost template in the whole frame, at any angle")
+    search_share: float = described(0.5, "of the time, what searches may take at most in the long run; 1: no bound")
     max_step: Point | None = described(
         None, "px and deg, how far a template moves and turns from one frame to the next at most", example=(5.0, 1.0)
     )
@@ -38,6 +40,7 @@ class Tracking(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         MaxStep.of(self.max_step)
+        income(self.search_share)
 
     def options(self) -> dict[str, Any]:
         """The keyword arguments of ``Tracker``."""

@@ -21,17 +21,20 @@ ANGLE_LOSS = 0.1  # of the smoothed texture's score, half way between two angles
 COARSEST_STEP, FINEST_STEP = math.radians(6), math.radians(1.5)  # from one angle to the next
 SMALLEST_DISC, LARGEST_DISC = 5, 24  # px: angles get closer with the radius, and this many pixels tell enough
 DISC_SHARE = 0.5  # of the texture must lie in a disc for the disc alone to be searched for
+TILE = 320  # px of a level that are transformed at once
 CHUNK = 4  # angles transformed at once: more would not stay in the cache
 
 
 class Bank(NamedTuple):
     """One template at ``angles`` (A,) rad as kernels of ``radius`` px around its point ``middle`` (2,), counted from
-    the point that poses speak of."""
+    the point that poses speak of; ``corners`` (x, y) of the tiles in which images are looked at one after the other, so
+    that kernels take no more memory for a larger frame (the overlap-save method)."""
 
     radius: int
     middle: Tensor
     angles: Tensor
     correlator: Correlator
+    corners: tuple[tuple[int, int], ...]
 
     @staticmethod
     def of(reference: Reference, size: tuple[int, int]) -> Bank:
@@ -48,22 +51,35 @@ class Bank(NamedTuple):
         else:
             weight = rotated(kept, angles, middle=about, size=side)
         texture, planes = detrended(texture, weight)
-        correlator = Correlator.of(texture, weight, planes=planes, size=(size[0] + 2 * radius, size[1] + 2 * radius))
-        return Bank(radius, (middle - template.centre[0]).to(template.radius.dtype), angles, correlator)
+        (h, rows), (w, columns) = (_tiles(n, max(TILE, 2 * radius)) for n in size)
+        corners = tuple((x, y) for y in rows for x in columns)
+        correlator = Correlator.of(texture, weight, planes=planes, size=(h + 2 * radius, w + 2 * radius))
+        return Bank(radius, (middle - template.centre[0]).to(template.radius.dtype), angles, correlator, corners)
 
     def candidates(self, image: Tensor, most: int) -> tuple[Tensor, Tensor]:
-        """Where ``image`` (h, w) looks most like the template: at most ``most`` poses (K, 3) per CHUNK of angles and
-        their scores (K,). They are local maxima over the places, each at the best angle of the chunk."""
+        """Where ``image`` (h, w) looks most like the template: at most ``most`` poses (K, 3) per tile and CHUNK of
+        angles, and their scores (K,). They are local maxima over the places, each at the best angle of the chunk."""
         padded = F.pad(image[None, None], (self.radius,) * 4, mode="replicate")[0]
+        variance = image.var(unbiased=False)[None]
         poses, scores = [], []
-        for score, angles in zip(self.correlator.scores(padded, CHUNK), self.angles.split(CHUNK), strict=True):
-            peak = peaks(F.pad(score.amax(1), (1, 1, 1, 1), value=-math.inf), most)
-            angle = angles[score[0].flatten(1)[:, peak.cell[0]].argmax(0)]
-            poses.append(torch.cat((peak.place[0], angle[:, None]), -1))
-            scores.append(peak.score[0])
+        h, w = (n + 2 * self.radius for n in self.correlator.places)
+        for x, y in self.corners:
+            chunks = self.correlator.scores(padded[:, y : y + h, x : x + w], CHUNK, variance)
+            for score, angles in zip(chunks, self.angles.split(CHUNK), strict=True):
+                peak = peaks(F.pad(score.amax(1), (1, 1, 1, 1), value=-math.inf), most)
+                angle = angles[score[0].flatten(1)[:, peak.cell[0]].argmax(0)]
+                poses.append(torch.cat((peak.place[0] + peak.place.new_tensor((x, y)), angle[:, None]), -1))
+                scores.append(peak.score[0])
         pose = torch.cat(poses).to(self.middle.dtype)
         back = F.pad(-self.middle, (0, 1))
         return compose(pose, back.expand_as(pose)), torch.cat(scores)
+
+
+def _tiles(n: int, most: int) -> tuple[int, list[int]]:
+    """Length of as few equal tiles of at most so many px as cover ``n``, and where each begins."""
+    count = -(-n // most)
+    length = -(-n // count)
+    return length, [k * (n - length) // max(count - 1, 1) for k in range(count)]
 
 
 def search_level(references: list[Reference]) -> int:

@@ -68,11 +68,17 @@ class Correlator(NamedTuple):
         spectra = (torch.fft.rfft2(kernel, s=shape).conj_physical() for kernel in (texture, planes, weight))
         return Correlator((size[0] - n + 1, size[1] - m + 1), shape, *spectra)
 
-    def scores(self, image: Tensor, chunk: int) -> Iterator[Tensor]:
-        """ZNCC (B, chunk, h, w) of images (B, h, w) at all places, for ``chunk`` angles after the other."""
+    @property
+    def size(self) -> int:
+        """How many complex numbers it holds."""
+        return self.texture.numel() + self.planes.numel() + self.weight.numel()
+
+    def scores(self, image: Tensor, chunk: int, variance: Tensor | None = None) -> Iterator[Tensor]:
+        """ZNCC (B, chunk, h, w) of images (B, h, w) at all places, for ``chunk`` angles after the other; ``variance``
+        (B,) of what they are parts of, by default their own."""
         image = image - image.mean((1, 2), keepdim=True)
         spectrum, square = (torch.fft.rfft2(i, s=self.shape)[:, None] for i in (image, image * image))
-        least = FLATTEST * image.square().mean((1, 2))[:, None, None, None]
+        least = FLATTEST * (image.square().mean((1, 2)) if variance is None else variance)[:, None, None, None]
         scale: Tensor | None = None
         for first in range(0, self.texture.shape[1], chunk):
             part = slice(first, first + chunk)

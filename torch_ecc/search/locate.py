@@ -104,7 +104,7 @@ class Locator:
 
     @lasting
     def __init__(self, reference: Reference, size: tuple[int, int], settings: Settings | None = None) -> None:
-        self.size = size
+        self.frame = size
         # A wrong place must not be made right by leaving out what does not fit.
         self.settings = replace(settings or Settings(min_visible=LEAST_VISIBLE), robust=False)
         self.pyramids, self.banks = [], []
@@ -120,6 +120,16 @@ class Locator:
         """How many levels of a frame it needs."""
         return max(map(len, self.pyramids))
 
+    @property
+    def size(self) -> int:
+        """How many complex numbers are kept."""
+        return sum(bank.correlator.size for bank in self.banks)
+
+    @property
+    def work(self) -> int:
+        """How many complex numbers a search multiplies."""
+        return sum(bank.correlator.size * len(bank.corners) for bank in self.banks)
+
     @plain
     @torch.no_grad()
     def __call__(self, image: Tensor, near: Tensor | None = None) -> Located:
@@ -127,8 +137,8 @@ class Locator:
         that are as good the one nearest to ``near`` (B, 2 or 3), px (and rad), if that is given."""
         gray = as_gray("locate", "image", image)
         count, device = len(self.banks), self.banks[0].angles.device
-        if gray.shape[-2:] != self.size or len(gray) not in (1, count):
-            (h, w), n = self.size, f"1 or {count}" if count > 1 else "1"
+        if gray.shape[-2:] != self.frame or len(gray) not in (1, count):
+            (h, w), n = self.frame, f"1 or {count}" if count > 1 else "1"
             raise ValueError(f"locate: image must be {n} of {w}x{h} px, got {tuple(gray.shape)}")
         if gray.device != device:
             raise ValueError(f"locate: image must be on the reference's device {device}, got {gray.device}")

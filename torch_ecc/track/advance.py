@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.track.budget import BURST
 
 MEMORY = 0.05  # weight of the newest frame in the usual score
 KEPT = 16  # frames for which a template that is not found is expected to go on as before
@@ -26,6 +27,7 @@ def beginning(start: Tensor) -> dict[str, Tensor]:
         "found": none.to(torch.int8),  # by a search, 0 or 1: averages of bool fail
         "suspect_frames": none,  # in a row
         "turn": none[0].clone(),  # (): which of many lost ones is searched for next
+        "credit": start.new_tensor(BURST),  # (): for searches, in frames, see ``budget``
     }
 
 

@@ -25,10 +25,12 @@ from torch_ecc.core.verdict import expected_score, just_as_good, noise_share, un
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
+from torch_ecc.track.budget import Budget
 from torch_ecc.track.max_step import MaxStep
 
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
-AT_ONCE = 8  # templates searched for in the whole of one frame; the others in turn
+AT_ONCE = 4  # templates searched for in the whole of one frame; the others in turn
+KEPT = 2**25  # complex numbers prepared for searches of the whole frame, 256 MB
 NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
 SELDOM = 16  # frames between two searches for what has been lost for long
@@ -95,11 +97,14 @@ def disproved(estimate: Estimate, lost: Tensor, reason: Reason) -> Estimate:
     )
 
 
-def ambiguous(estimate: Estimate, index: Tensor) -> Estimate:
-    """The ``estimate`` that tells of those at ``index`` (n,) that are lost that a look-alike is why."""
+def told(estimate: Estimate, templates: list[int], reason: Reason) -> Estimate:
+    """The ``estimate`` that tells of those ``templates`` that are lost that this ``reason`` is why."""
+    if not templates:
+        return estimate
+    index = torch.tensor(templates, device=estimate.status.device)
     lost = estimate.status[index] == Status.LOST
-    reason = torch.where(lost, int(Reason.AMBIGUOUS), estimate.reason[index]).to(torch.int8)
-    return estimate._replace(reason=estimate.reason.index_copy(0, index, reason))
+    codes = torch.where(lost, int(reason), estimate.reason[index]).to(torch.int8)
+    return estimate._replace(reason=estimate.reason.index_copy(0, index, codes))
 
 
 def familiar(found: Estimate, usual: Tensor) -> Tensor:
@@ -124,10 +129,10 @@ class Recovery:
     """The searches of one tracker, and what is prepared for them."""
 
     @lasting
-    def __init__(self, reference: Reference, settings: Settings, turn: Tensor, max_step: MaxStep) -> None:
+    def __init__(self, reference: Reference, settings: Settings, budget: Budget, max_step: MaxStep) -> None:
         # A wrong place must not be made right by leaving out what does not fit.
         self.reference, self.settings, self.max_step = reference, replace(settings, robust=False), max_step
-        self.turn = turn  # whose turn it is if they are many, (): the tracker's, written in place
+        self.budget = budget
         self.expected = expected_score(reference)
         self.textureless, self.hopeless = textureless(reference, settings)
         self.locators: dict[int, Locator] = {}  # of the templates last searched for
@@ -139,16 +144,20 @@ class Recovery:
         """The ``estimate`` of a frame with those templates searched for that are suspect and due: at ``start`` (R, 3)
         first, then in the whole frame. ``images``: the frame, and as many coarser levels as there are already.
         """
+        estimate = self.rejoin(images[0], estimate, past)
         due = self.due(estimate, past)
-        if not due:
-            return estimate
+        if not due or not self.budget.left():
+            return told(estimate, due, Reason.WAITING)
         images[:] = self.unmarked(images)
         found = self.search_near(images[0], estimate, start, past, sorted(due))
         estimate = self.follow(images[0], self.own(found, estimate, start, past), start, past.usual)
         suspects = suspect(estimate, past.usual)
         kept = plausible(estimate, start, past, self.reference.place.radius).tolist()
-        gone = [r for r in due if suspects[r] and not kept[r] and not self.searched_all(past.since[r])][:AT_ONCE]
-        for r in gone:
+        gone = [r for r in due if suspects[r] and not kept[r] and not self.searched_all(past.since[r])]
+        for k, r in enumerate(gone):
+            if k == AT_ONCE or not self.budget.left():
+                estimate = told(estimate, gone[k:], Reason.WAITING)
+                break
             estimate = self.search_anywhere(images, estimate, past, r)
         return self.follow(images[0], estimate, start, past.usual) if gone else estimate
 
@@ -164,19 +173,18 @@ class Recovery:
         codes, suspects = estimate.status.tolist(), suspect(estimate, past.usual)
         for r, (n, code) in enumerate(zip(past.suspect_frames.tolist(), codes, strict=True)):
             rarely = code <= Status.MAX_ITERATIONS or self.textureless[r]
-            pause = n & (n - 1) if rarely else n % min(1 << min(n // PATIENCE, 8), SELDOM)
+            pause = n & (n - 1) if rarely else (n + r) % min(1 << min(n // PATIENCE, 8), SELDOM)
             if suspects[r] and pause == 0 and not self.hopeless[r]:
                 due.append(r)
-        if len(due) > AT_ONCE:
-            turn = int(self.turn.add_(AT_ONCE).remainder_(len(due)))
-            due = due[turn:] + due[:turn]
-        return due[:NEARBY_AT_ONCE]
+        return self.budget.in_turn(due, AT_ONCE)[:NEARBY_AT_ONCE]
 
     def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, past: Past, due: list[int]) -> Estimate:
         """Second attempt for the templates ``due``: around their ``start`` (R, 3)."""
         index = torch.tensor(due, device=start.device)
         view = image if len(image) == 1 else image[index]
-        found = self.surroundings(due).find(
+        surroundings = self.surroundings(due)
+        self.budget.spend(surroundings.correlator.size)
+        found = surroundings.find(
             self.reference.select(index), view, start[index], self.settings, self.allowed(past, index)
         )
         known = familiar(found, past.usual[index]) & beats(found, estimate.at(index))
@@ -198,6 +206,7 @@ class Recovery:
     def search_anywhere(self, images: list[Tensor], estimate: Estimate, past: Past, r: int) -> Estimate:
         """Third attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
         locator, pose = self.locator(r, (images[0].shape[-2], images[0].shape[-1])), past.pose[r]
+        self.budget.spend(locator.work)
         images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
         index = torch.tensor([r], device=pose.device)
@@ -211,7 +220,7 @@ class Recovery:
         others = LookAlikes.around(found, best.pose[0], radius).nearest(best.score[0], torch.ones_like(radius))
         twin = torch.minimum(others, self.twin(r, best.score[0], past, locator))
         if self.confusable(distance, twin, distance + self.max_step.reach(past.since[r], radius)):
-            return ambiguous(estimate, index)
+            return told(estimate, [r], Reason.AMBIGUOUS)
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
 
@@ -230,7 +239,7 @@ class Recovery:
         distance, moved = (pose_distance(found.pose[leapt], p[leapt], radius=radius) for p in (start, past.pose))
         farthest = moved + self.max_step.reach(past.since[leapt], radius)
         doubtful = leapt[self.confusable(distance, twin, farthest)]
-        return ambiguous(found.put(doubtful, before.at(doubtful)), doubtful)
+        return told(found.put(doubtful, before.at(doubtful)), doubtful.tolist(), Reason.AMBIGUOUS)
 
     @staticmethod
     def confusable(distance: Tensor, twin: Tensor, farthest: Tensor) -> Tensor:
@@ -243,20 +252,31 @@ class Recovery:
         tells and a place of ``score`` (R,) or (), which would be a look-alike's: there is less noise now."""
         return (torch.maximum(score, usual) / self.expected.clamp(min=1e-6)).clamp(min=1.0)
 
+    def rejoin(self, image: Tensor, estimate: Estimate, past: Past) -> Estimate:
+        """Where most have gone the same way from the first frame, those that are lost are tried there, which costs
+        next to nothing."""
+        good = Status.good(estimate.status)
+        lost = (~good).nonzero()[:, 0]
+        expected = gone_together(estimate, past.home, good) if len(image) == 1 and len(lost) else None
+        return estimate if expected is None else self.tried(image.float(), estimate, expected, lost, past.usual)
+
     def follow(self, image: Tensor, estimate: Estimate, start: Tensor, usual: Tensor) -> Estimate:
         """Where several have been found away from their ``start`` (R, 3) and most have gone the same way, all that have
         not are tried there."""
-        expected = None if len(image) > 1 else gone_together(estimate, start)
+        good, searched = Status.good(estimate.status), estimate.origin != Origin.TRACKED
+        expected = gone_together(estimate, start, good & searched) if len(image) == 1 else None
         if expected is None:
             return estimate
-        good = Status.good(estimate.status)
         off = torch.hypot(*(estimate.pose - expected)[:, :2].T) > TOGETHER
-        doubted = torch.tensor(suspect(estimate, usual), device=start.device) | (estimate.origin != Origin.TRACKED)
-        index = (doubted & (off | ~good)).nonzero()[:, 0]
+        doubted = torch.tensor(suspect(estimate, usual), device=start.device) | searched
+        return self.tried(image, estimate, expected, (doubted & (off | ~good)).nonzero()[:, 0], usual)
+
+    def tried(self, image: Tensor, estimate: Estimate, expected: Tensor, index: Tensor, usual: Tensor) -> Estimate:
+        """The ``estimate`` with templates at ``index`` (n,) where they are ``expected`` (R, 3), if they are there."""
         if len(index) == 0:
             return estimate
-        found = solve(self.reference.select(index), image, expected[index], self.settings)
-        known = familiar(found, usual[index]) & (~good[index] | within_margin(found.score, estimate.score[index]))
+        found, good = solve(self.reference.select(index), image, expected[index], self.settings), estimate.ok[index]
+        known = familiar(found, usual[index]) & (~good | within_margin(found.score, estimate.score[index]))
         found = found._replace(origin=torch.full_like(found.origin, int(Origin.NEARBY)))
         return estimate.put(index[known], found.at(known))
 
@@ -284,24 +304,24 @@ class Recovery:
 
     @lasting
     def locator(self, r: int, size: tuple[int, int]) -> Locator:
-        """The search for template ``r``, kept for the ``AT_ONCE`` last ones."""
+        """The search for template ``r``; those last used are kept."""
         if r not in self.locators:
-            if len(self.locators) >= AT_ONCE:
-                del self.locators[next(iter(self.locators))]
             template = self.reference.select(torch.tensor([r], device=self.reference.K.device))
-            self.locators[r] = Locator(template, size, replace(self.settings, min_visible=LEAST_VISIBLE))
+            new = Locator(template, size, replace(self.settings, min_visible=LEAST_VISIBLE))
+            while self.locators and new.size + sum(each.size for each in self.locators.values()) > KEPT:
+                del self.locators[next(iter(self.locators))]
+            self.locators[r] = new
         return self.locators[r]
 
 
-def gone_together(estimate: Estimate, start: Tensor) -> Tensor | None:
-    """Where all templates are expected (R, 3) if they have moved from the ``start`` (R, 3) as most of those that a
-    search has found; None if these are few or have not gone the same way."""
-    found = (estimate.origin != Origin.TRACKED) & Status.good(estimate.status)
-    count = int(found.sum())
+def gone_together(estimate: Estimate, start: Tensor, those: Tensor) -> Tensor | None:
+    """Where all templates are expected (R, 3) if they have moved from the ``start`` (R, 3) as most of ``those`` (R,)
+    have; None if these are few or have not gone the same way."""
+    count = int(those.sum())
     if count < FEWEST_TOGETHER:
         return None
-    expected = compose(common_motion(start[found], estimate.pose[found]).expand_as(start), start)
-    agree = torch.hypot(*(estimate.pose - expected)[found, :2].T) <= TOGETHER
+    expected = compose(common_motion(start[those], estimate.pose[those]).expand_as(start), start)
+    agree = torch.hypot(*(estimate.pose - expected)[those, :2].T) <= TOGETHER
     return expected if int(agree.sum()) >= max(FEWEST_TOGETHER, count // 2 + 1) else None
 
 

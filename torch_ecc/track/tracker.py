@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -25,6 +26,7 @@ from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
 from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, coast
+from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, suspect
@@ -57,7 +59,8 @@ class Tracker(nn.Module):
     it is out of view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
     (``core.robust``); ``search``: look for a template that is lost, or looks less like itself than usual, near where it
     is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
-    more seldom the longer it stays so (every 16th frame in the end); ``max_step``: (px, deg), how far a template's
+    more seldom the longer it stays so (every 16th frame in the end); ``search_share``: of the time, what searches may
+    take at most in the long run (1: no bound); ``max_step``: (px, deg), how far a template's
     centre moves, and how far it turns, from one frame to the next at most: nothing farther is believed, nor looked at;
     ``backend``: "auto", "torch" or "native", see
     settings.Settings.
@@ -81,6 +84,7 @@ class Tracker(nn.Module):
     found: Tensor
     suspect_frames: Tensor
     turn: Tensor
+    credit: Tensor
 
     @lasting
     def __init__(  # noqa: PLR0913 - the constructor is the list of all choices
@@ -103,6 +107,7 @@ class Tracker(nn.Module):
         min_visible: float = 0.25,
         robust: bool = True,
         search: bool = True,
+        search_share: float = 0.5,
         max_step: tuple[float, float] | None = None,
         backend: str = "auto",
     ) -> None:
@@ -110,7 +115,7 @@ class Tracker(nn.Module):
         _check_prediction(prediction)
         self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, robust, backend)
         self.prediction, self.search, self.criterion = prediction, search, make_criterion(criterion, illumination)
-        self.max_step = MaxStep.of(max_step)
+        self.max_step, self.income = MaxStep.of(max_step), income(search_share)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape, self.levels = tuple(gray.shape), levels
         self.frame_mask = _frame_mask("Tracker", frame_mask, gray)
@@ -159,7 +164,8 @@ class Tracker(nn.Module):
     def _use(self, references: list[Reference]) -> None:
         """Goes on with ``references``, in what the camera shows."""
         self.references = [seen_through(references[0], self.frame_mask), *references[1:]]
-        self._recovery = Recovery(self.references[0], self.settings, self.turn, self.max_step)
+        budget = Budget(self.credit, self.turn, math.prod(self.frame_shape), self.template.numel())
+        self._recovery = Recovery(self.references[0], self.settings, budget, self.max_step)
         alone = len(self.start) == 1 or self.frame_shape[0] > 1
         self._crowd = None if alone else Crowd(self.start[:, :2])
 
@@ -242,6 +248,7 @@ class Tracker(nn.Module):
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image]
+        state["credit"].add_(self.income)
         estimate = self._within_reach(self._solve(images, start))
         doubtful = any(suspect(estimate, state["score"]))
         if doubtful and self.search:

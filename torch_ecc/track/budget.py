@@ -1,0 +1,43 @@
+"""How much of the time may go into searches: counted in pixels, not seconds, so that every machine does the same.
+
+The credit is in frames, each of which costs the reading of its pixels and the solves of its templates. What a search
+costs is taken from it, perhaps on loan; every frame adds what keeps searches at their share of all time.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+BURST = 1000.0  # frames of credit at most, and at first
+SOLVE = 20  # times the pixels of a template: its solve
+CORRELATION = 4  # times the pixels of a spectrum, for every angle
+
+
+class Budget:
+    """Of frames of ``pixels`` with templates of ``textured`` pixels in all. ``credit`` () and whose ``turn`` () it is
+    if many are lost are parts of a tracker's state, written in place."""
+
+    def __init__(self, credit: Tensor, turn: Tensor, pixels: int, textured: int) -> None:
+        self.credit, self.turn, self.frame = credit, turn, pixels + SOLVE * textured
+
+    def left(self) -> bool:
+        """Whether there is any credit, which is BURST at most."""
+        return float(self.credit.clamp_(max=BURST)) > 0
+
+    def spend(self, spectra: int) -> None:
+        """On correlations with ``spectra`` values."""
+        self.credit.sub_(CORRELATION * spectra / self.frame)
+
+    def in_turn(self, due: list[int], served: int) -> list[int]:
+        """Those ``due`` in the order in which it is their turn, if no more than so many are ``served`` at once."""
+        if len(due) <= served:
+            return due
+        turn = int(self.turn.add_(served).remainder_(len(due)))
+        return due[turn:] + due[:turn]
+
+
+def income(share: float) -> float:
+    """Frames of credit per frame. ValueError for what is no share of the time."""
+    if not (isinstance(share, int | float) and 0 < share <= 1):
+        raise ValueError(f"search_share: expected a share of the time > 0 and at most 1, got {share!r}")
+    return BURST if share == 1 else min(share / (1 - share), BURST)
