@@ -30,6 +30,8 @@ KINDS = {
     "masks": {"mask": torch.stack((DISC, ~DISC))},
     "hold": {"prediction": "hold"},
     "ssd": {"criterion": "ssd"},
+    "average": {"average": 3},
+    "renew": {"renew": 2},
 }
 
 
@@ -122,6 +124,7 @@ REFUSED = {
     "size": (lambda: made(size=(31, 27)), r"size must be \[31, 27\], as this tracker's, got \[31, 29\]"),
     "criterion": (lambda: made(criterion="ssd"), r"criterion must be SSD\(\), as this tracker's, got ECC\("),
     "illumination": (lambda: made(illumination="gain"), "criterion must be ECC.*'gain'.*, got ECC.*'linear'"),
+    "average": (lambda: made(average=5), "average must be 5, as this tracker's, got 1"),
     "levels": (lambda: made(levels=2), "levels must be 2, as this tracker's, got 1"),
     "frame": (
         lambda: made(FRAMES[0, 1:]),

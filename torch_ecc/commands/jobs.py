@@ -36,6 +36,10 @@ class Tracking(Settings):
         None, "px and deg, how far a template moves and turns from one frame to the next at most", example=(5.0, 1.0)
     )
     device: str | None = described(None, "without it, the CPU", example="cuda")
+    average: int = described(1, "the templates become the mean of so many frames: less noise in dim pictures")
+    renew: int | None = described(
+        None, "they become the mean of the last so many frames, again and again: surfaces that change", example=20
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

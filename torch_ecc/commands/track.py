@@ -27,6 +27,7 @@ from torch_ecc.io.stabilised import StabilisedWriter
 from torch_ecc.io.stacks import Stack
 from torch_ecc.io.summary import plain
 from torch_ecc.io.track import FILES
+from torch_ecc.track.lessons import LESSONS
 from torch_ecc.track.tracker import Tracker
 
 Pictures: TypeAlias = OverlayWriter | StabilisedWriter
@@ -35,7 +36,7 @@ STATUS_NAMES = {int(code): code.name for code in Status}
 REASON_NAMES = {int(code): code.word for code in Reason}
 RESULTS = (*FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
 NOT_OF_THE_RESULT = ("out", "force", "resume")
-CONSTANT = ("template", "mask", "centre", "first")  # of a tracker's state
+CONSTANT = ("template", "mask", "centre", "first", *LESSONS)  # of a tracker's state, or too large for a journal
 
 
 class Finished(NamedTuple):
@@ -183,7 +184,8 @@ class Session:
             before, now = left.settings.get(name), self.settings.get(name)
             if before != now:
                 raise ValueError(f"resume: {name} was {before!r} in the run in {self.folder}, and is {now!r} now")
-        whole = min([left.frames, *(each.film.left for each in films)])
+        # What templates have learned is in no journal: all of it has to be tracked again.
+        whole = 0 if self.tracker.learns else min([left.frames, *(each.film.left for each in films)])
         return left._replace(frames=whole) if whole else None
 
     def _frames(self, left: Unfinished | None) -> Iterator[Frame]:

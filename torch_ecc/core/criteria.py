@@ -189,3 +189,9 @@ def make_criterion(criterion: str | Criterion, illumination: str = "linear") -> 
         raise ValueError(f"criterion: expected one of {list(CRITERIA)} or an object, got {criterion!r}")
     ECC(illumination)  # a wrong word is told whatever the criterion
     return CRITERIA[criterion](illumination)
+
+
+def named(criterion: Criterion) -> str:
+    """What tells a criterion, in another process too: its own words if it has some, or its class."""
+    kind = type(criterion)
+    return f"{kind.__module__}.{kind.__qualname__}" if kind.__repr__ is object.__repr__ else repr(criterion)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.criteria import centred
+from torch_ecc.core.pose import pose_dtype
 from torch_ecc.core.sampling import blur, gradients, noise_level
 
 INSTRUMENT_BLUR = 0.9  # px; 0.7 to 1 serve alike
@@ -17,11 +19,36 @@ CERTAIN = 1.3  # times the noise's power in that window: by chance alone it is n
 LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
 
 
-def template_noise(gray: Tensor, kept: Tensor) -> Tensor:
-    """Upper estimate (B,) of the noise of templates (B, 1, h, w), grey levels, where ``kept`` > 0."""
+class Noise(NamedTuple):
+    """Of B templates: ``level`` (B,), upper estimate of their noise, grey levels, ``power`` (B,), its square, and how
+    many ``frames`` (B,) each is the mean of; ``alias``, of each sampler whose own error counts: (B, 3, 2), by how far
+    aliasing along the template's x and y shifts the pose, rms over the phase; ``place`` (B, 3, 3): covariance of where
+    the template itself lies, in its axes, None if that is certain."""
+
+    level: Tensor
+    power: Tensor
+    frames: Tensor
+    alias: dict[str, Tensor]
+    place: Tensor | None = None
+
+    @staticmethod
+    def of(level: Tensor) -> Noise:
+        """Of templates cut from one frame."""
+        power = level.to(pose_dtype(level.device)).square()
+        return Noise(level, power, torch.ones_like(power), {})
+
+    @property
+    def of_frame(self) -> Tensor:
+        """The power (B,) of the noise of one frame."""
+        return self.power * self.frames
+
+
+def template_noise(gray: Tensor, kept: Tensor, known: Tensor | None = None) -> Tensor:
+    """Upper estimate (B,) of the noise of templates (B, 1, h, w), grey levels, where ``kept`` > 0, unless it is
+    ``known`` (B,); never less than next to nothing of the contrast."""
     weight = kept.flatten(1)
     contrast = centred(gray.flatten(1), weight)[1] / weight.sum(-1).sqrt()
-    return torch.maximum(noise_level(gray, kept), LEAST_NOISE * contrast)
+    return torch.maximum(noise_level(gray, kept) if known is None else known.to(contrast), LEAST_NOISE * contrast)
 
 
 def wiener_weight(gradient: Tensor, noise: Tensor) -> Tensor:

@@ -30,6 +30,13 @@ def pyramid(reference: Reference, levels: int) -> list[Reference]:
     return references
 
 
+def check_levels(levels: int, size: tuple[int, int]) -> None:
+    """ValueError for ``levels`` that templates of ``size`` (h, w) cannot have."""
+    most = max((min(size) // SMALLEST_COARSE).bit_length(), 1)
+    if not isinstance(levels, int) or not 1 <= levels <= most:
+        raise ValueError(f"levels: expected 1 to {most} for templates of {size[1]}x{size[0]} px, got {levels}")
+
+
 def as_images(reference: Reference) -> tuple[Tensor, Tensor, Tensor]:
     """Template and weights as images (B, 1, h, w), zero where nothing counts, and the place (2,) of their pixel (0, 0)
     relative to the middle of the template array."""

@@ -16,7 +16,7 @@ approximation that serves while the motion between frames is small; with eq. 10 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
@@ -28,7 +28,7 @@ from torch_ecc.core.ambient import lasting
 from torch_ecc.core.blocks import Blocks, Parts, blocks_of, parts_of
 from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
-from torch_ecc.core.noise import INSTRUMENT_BLUR, template_noise, wiener_weight
+from torch_ecc.core.noise import INSTRUMENT_BLUR, Noise, template_noise, wiener_weight
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.pose import pose_dtype, rotation
 from torch_ecc.core.sampling import SAMPLERS, aliasing, blur, gradients, pad
@@ -84,16 +84,6 @@ class Columns(NamedTuple):
     weight: Tensor
     unit: Tensor
     level: Tensor
-
-
-class Noise(NamedTuple):
-    """``level`` (B,): upper estimate of the template's noise, grey levels, and ``power`` (B,), its square; ``alias``,
-    of each sampler whose own error counts: (B, 3, 2), by how far aliasing along the template's x and y shifts the pose,
-    rms over the phase."""
-
-    level: Tensor
-    power: Tensor
-    alias: dict[str, Tensor]
 
 
 class Sight(NamedTuple):
@@ -201,12 +191,14 @@ def prepare(
     illumination: str = "linear",
     mask: Tensor | None = None,
     centre: Tensor | None = None,
+    noise: Tensor | None = None,
 ) -> Reference:
     """Everything constant of B templates: (B, 1, h, w), (C, h, w) or (h, w) -> Reference (eqs. 7, 8).
 
     ``mask``: (h, w) or (B, h, w), True or a weight > 0 where the template counts. ``centre`` (B, 2): the point that
-    poses speak of, px from the middle of the array (default: the middle). Raises ValueError for bad shapes, dtypes,
-    NaN, unknown options and for templates of one single grey level.
+    poses speak of, px from the middle of the array (default: the middle). ``noise`` (B,): the templates' own, grey
+    levels (default: estimated, where fine texture counts as noise). Raises ValueError for bad shapes, dtypes, NaN,
+    unknown options and for templates of one single grey level.
     """
     chosen = make_criterion(criterion, illumination)
     gray = as_gray("prepare", "template", template)
@@ -219,9 +211,10 @@ def prepare(
     if centre.shape != (len(gray), 2):
         raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
     centre = centre.to(gray, copy=True)  # what is prepared keeps it
+    noise = template_noise(gray, kept, noise)
     some, used = max(PIXELS_AT_ONCE // gray[0].numel(), 1), (kept > 0).any(0).flatten()
-    parts = zip(gray.split(some), kept.expand(len(gray), -1, -1, -1).split(some), centre.split(some), strict=True)
-    return _joined((_prepared(chosen, *part, used) for part in parts), len(gray))
+    given = (value.split(some) for value in (gray, kept.expand(len(gray), -1, -1, -1), centre, noise))
+    return _joined((_prepared(chosen, part, used) for part in zip(*given, strict=True)), len(gray))
 
 
 def _joined(parts: Iterator[Reference], count: int) -> Reference:
@@ -245,14 +238,15 @@ def _refuse_flat(gray: Tensor, kept: Tensor) -> None:
         raise ValueError(f"prepare: template must have texture, got one single grey level in template {flat}")
 
 
-def _prepared(criterion: Criterion, gray: Tensor, kept: Tensor, centre: Tensor, used: Tensor) -> Reference:
-    """``prepare`` of grey templates (B, 1, h, w) with weights (B, 1, h, w), of which the pixels ``used`` (h w,) count
-    in any template, about ``centre`` (B, 2)."""
+def _prepared(criterion: Criterion, given: Sequence[Tensor], used: Tensor) -> Reference:
+    """``prepare`` of what is ``given``, grey templates (B, 1, h, w) with weights (B, 1, h, w), ``centre`` (B, 2) and
+    noise (B,), of which the pixels ``used`` (h w,) count in any template."""
+    gray, kept, centre, noise = given
 
     def counted(images: Tensor) -> Tensor:  # (B, k, h, w) to (B, k, N)
         return images[:, :, MARGIN:-MARGIN, MARGIN:-MARGIN].flatten(2)[:, :, used]
 
-    grid, wide, noise = _grid(used, gray), pad(gray, MARGIN), template_noise(gray, kept)
+    grid, wide = _grid(used, gray), pad(gray, MARGIN)
     soft = blur(wide, INSTRUMENT_BLUR)
     slopes = gradients(soft)
     wiener = counted(wiener_weight(slopes, noise))
@@ -263,7 +257,7 @@ def _prepared(criterion: Criterion, gray: Tensor, kept: Tensor, centre: Tensor, 
         torch.cat((counted(gradients(wide)), counted(wide)), 1),
     )
     columns = _columns(grid.pixels[:2] - centre[:, :, None], images, wiener[:, 0], weight)
-    reference = _solved(criterion, grid, place, columns, Noise(noise, noise.to(place.radius.dtype).square(), {}))
+    reference = _solved(criterion, grid, place, columns, Noise.of(noise))
     for name, kernel in SAMPLERS.items():
         if kernel.aliases:
             shift = reference.K[:, :3] @ counted(aliasing(wide, name)).mT

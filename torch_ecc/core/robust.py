@@ -250,7 +250,7 @@ def least_noise(reference: Reference, settings: Settings) -> Tensor:
     without prefilter, what it rounds off itself."""
     contrast = reference.normal.energy / reference.normal.total.clamp(min=LEAST)
     share = LEAST_NOISE if SAMPLERS[settings.interpolation].ring else ROUNDED_OFF
-    least = torch.maximum(reference.noise.power, share**2 * contrast)
+    least = torch.maximum(reference.noise.of_frame, share**2 * contrast)
     return least.to(reference.K.dtype).unsqueeze(1)
 
 

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from torch_ecc.core.ambient import plain, threads_for
 from torch_ecc.core.frame import as_gray, require_tensor
-from torch_ecc.core.noise import INSTRUMENT_BLUR, LEAST_NOISE, wiener_weight
+from torch_ecc.core.noise import INSTRUMENT_BLUR, LEAST_NOISE, Noise, wiener_weight
 from torch_ecc.core.normal import Moments, normal_equations
 from torch_ecc.core.patches import QUANTISATION, Size, as_size
 from torch_ecc.core.pose import turn
-from torch_ecc.core.reference import MARGIN, Grid, Noise, Place, Reference
+from torch_ecc.core.reference import MARGIN, Grid, Place, Reference
 from torch_ecc.core.sampling import blur, clipped, gradients, noise_samples, pad
 from torch_ecc.core.verdict import LARGEST_SIGMA, largest_variance, noise_share, pose_covariance
 
@@ -128,7 +128,7 @@ def _predicted(gray: Tensor, windows: _Windows, rounding: float) -> Tensor:
     lever2 = torch.stack((none + 1, none + 1, none + ((h - 1) ** 2 + (w - 1) ** 2) / 4), 1)
     grid = Grid(torch.empty(3, h * w), torch.empty(3, 4), torch.empty(2), torch.empty(0), (0, 0), 0)
     place = Place(torch.empty(0), torch.empty(0), lever2.sqrt(), lever2, torch.empty(0))
-    reference = cast(Reference, _Judged(Noise(level, level.square(), {}), grid, place))
+    reference = cast(Reference, _Judged(Noise.of(level), grid, place))
     variance = level.square() + rounding
     covariance = pose_covariance(reference, normal, variance, none + 2, turn(none))
     observable = largest_variance(reference, covariance) <= LARGEST_SIGMA**2

@@ -59,10 +59,12 @@ def judge(
     if not on_cpu or min(score.tolist()) < settings.min_score:
         match = torch.maximum(score, detrended(normal, total))  # light alone must not make a stranger of the template
     power, error, axes = found.gain.square(), total[:, 6], turn(pose[:, 2])
-    of_both = 1 + power  # variance of template and frame together
-    # One image's noise v: of the residuals' mean square the template's part is gain^2 v, the frame's, sampled, NG v.
-    variance = error / (power + SAMPLERS[settings.interpolation].noise_gain).mul_(normal.freedom)
-    scatter, strained = clinging(reference, found, variance, of_both)
+    of_both = 1 + power  # variance of template and frame together: where it lies, one frame alone has told
+    # One image's noise v: of the residuals' mean square the template's part is gain^2 v / frames, the frame's, sampled,
+    # NG v.
+    of_template = power / reference.noise.frames
+    variance = error / (of_template + SAMPLERS[settings.interpolation].noise_gain).mul_(normal.freedom)
+    scatter, strained = clinging(reference, found, variance, of_template.add_(1))
     alias = interpolation_error(reference, axes, settings.interpolation)
     covariance = pose_covariance(reference, normal, variance, of_both / power, axes, scatter, alias)
     visible, believed = seen_and_believed(reference, found)
@@ -111,7 +113,7 @@ def explained(
 def without_contrast(reference: Reference, found: Solution) -> Tensor:
     """Where (B,) what is believed is as good as flat."""
     normal = found.normal
-    most = torch.maximum(LEAST_CONTRAST**2 * normal.energy, BARE_NOISE * reference.noise.power * normal.total)
+    most = torch.maximum(LEAST_CONTRAST**2 * normal.energy, BARE_NOISE * reference.noise.of_frame * normal.total)
     flat: Tensor = found.total[:, 2] <= most
     return flat
 
@@ -148,9 +150,10 @@ def seen_and_believed(reference: Reference, found: Solution) -> tuple[Tensor, Te
 
 
 def expected_score(reference: Reference) -> Tensor:
-    """The correlation (B,) of two images of the same template with the noise that the template seems to have."""
-    noise, normal = reference.noise.level, reference.normal
-    return (1 - noise.square() * normal.total / normal.energy).clamp(min=0.0)
+    """The correlation (B,) of the template and another image of it with the noise that a frame seems to have."""
+    noise, normal = reference.noise, reference.normal
+    mean = (1 + noise.frames.to(noise.level)) / 2  # of the frame's noise and the template's, over the template's
+    return (1 - noise.level.square() * mean * normal.total / normal.energy).clamp(min=0.0)
 
 
 def just_as_good(best: Number) -> Number:
@@ -215,7 +218,7 @@ def pose_covariance(
     derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 1 or 3): see
     ``clinging``, by default white; ``alias`` (B, 3, 2): see ``interpolation_error``.
     """
-    bias = torch.minimum(variance, reference.noise.power)[:, None, None]
+    bias = torch.minimum(variance / reference.noise.frames, reference.noise.power)[:, None, None]
     bread = torch.addcmul(normal.bread, bias, normal.bread_bias, value=-1)
     meat = torch.addcmul(factor[:, None, None] * normal.meat, bias, normal.meat_bias, value=-1)
     cofactors = torch.linalg.cross(bread.roll(-1, 1), bread.roll(-2, 1))  # the inverse is their transpose / det
@@ -223,6 +226,8 @@ def pose_covariance(
     scale = (variance.unsqueeze(1) if scatter is None else scatter).sqrt().unsqueeze(2)
     bread = torch.bmm(axes, cofactors.mT * (scale / determinant))
     covariance = torch.bmm(torch.bmm(bread, meat), bread.mT)
+    if reference.noise.place is not None:
+        covariance = covariance + axes @ reference.noise.place @ axes.mT
     if alias is None:
         return covariance
     alias = torch.bmm(axes, alias)
@@ -238,9 +243,9 @@ def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = 
     """The largest part (B,) of the information in any direction that the template's noise can be, whose variance is at
     most ``variance`` (B,), over what it may be: the more pixels there are, the better noise is told from texture.
     Infinite or NaN where the texture leaves a direction open."""
-    power = reference.noise.power
+    power, frames = reference.noise.power, reference.noise.frames
     most = max(NOISE_SHARE, 1 - CHANCE / reference.grid.pixels.shape[1] ** 0.5)
-    share = normal.noise_share * (power if variance is None else torch.minimum(power, variance))
+    share = normal.noise_share * (power if variance is None else torch.minimum(power, variance / frames))
     return share.div(most)
 
 

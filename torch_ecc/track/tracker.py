@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Self
 
@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain, threads_for
-from torch_ecc.core.criteria import Criterion, make_criterion
+from torch_ecc.core.criteria import Criterion, make_criterion, named
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
-from torch_ecc.core.patches import Centers, Crop, Size, crop, locate_patches, unmarked
+from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
 from torch_ecc.core.pose import ahead
-from torch_ecc.core.pyramid import SMALLEST_COARSE, pyramid
+from torch_ecc.core.pyramid import check_levels, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import as_frame_mask, filled, seen_through
@@ -28,12 +28,13 @@ from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_z
 from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, coast
 from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.crowd import Crowd
+from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, told
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
-DERIVED = ("references", "_recovery", "_crowd")
+DERIVED = ("references", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
 
 
 class SequenceError(ValueError):
@@ -62,8 +63,11 @@ class Tracker(nn.Module):
     more seldom the longer it stays so (every 16th frame in the end); ``search_share``: of the time, what searches may
     take at most in the long run (1: no bound); ``max_step``: (px, deg), how far a template's
     centre moves, and how far it turns, from one frame to the next at most: nothing farther is believed, nor looked at;
-    ``backend``: "auto", "torch" or "native", see
-    settings.Settings.
+    ``backend``: "auto", "torch" or "native", see settings.Settings. ``average``: the templates become the mean of so
+    many frames, the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last so
+    many frames, again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up,
+    and sigma tells what the anchor is still worth. Nothing is learned from frames that are not CONVERGED or are
+    covered, nor where something is suddenly another.
 
     What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
     with its own options. A state comes whole or not at all; what does not fit is refused before anything is changed.
@@ -110,9 +114,12 @@ class Tracker(nn.Module):
         search_share: float = 0.5,
         max_step: tuple[float, float] | None = None,
         backend: str = "auto",
+        average: int = 1,
+        renew: int | None = None,
     ) -> None:
         super().__init__()
         _check_prediction(prediction)
+        self.rounds = as_rounds(average, renew)  # frames that the first lesson takes, and each later one
         self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, robust, backend)
         self.prediction, self.search, self.criterion = prediction, search, make_criterion(criterion, illumination)
         self.max_step, self.income = MaxStep.of(max_step), income(search_share)
@@ -120,13 +127,21 @@ class Tracker(nn.Module):
         self.frame_shape, self.levels = tuple(gray.shape), levels
         self.frame_mask = _frame_mask("Tracker", frame_mask, gray)
         patches = unmarked("Tracker", locate_patches("Tracker", gray, centers, size, mask), self.frame_mask)
-        _check_levels(levels, patches.size)
+        check_levels(levels, patches.size)
+        self._begin(gray, patches)
+
+    def _begin(self, gray: Tensor, patches: Patches) -> None:
+        """The state before the first frame that is tracked."""
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
         first = _kept(filled(gray, self.frame_mask))  # frame: what else in it looks like them?
         for name, value in {**templates._asdict(), "first": first, **beginning(start)}.items():
             self.register_buffer(name, value)
-        self._use(self._prepared(*templates))
+        self._use(self._prepared(self._buffers))
         self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
+        if self.learns:
+            for name, value in Lessons.begin(self.template, self.references[0].noise.level, start).items():
+                self.register_buffer(name, value)
+            self._use([told(self.references[0], self._buffers), *self.references[1:]])
         _warn_of_textureless(self._recovery.textureless)
 
     @classmethod
@@ -154,9 +169,16 @@ class Tracker(nn.Module):
         tracker.pose.copy_(located.pose)
         return tracker, located
 
-    def _prepared(self, template: Tensor, mask: Tensor, centre: Tensor) -> list[Reference]:
-        """Every level of templates as ``crop`` gives them."""
-        references = pyramid(prepare(template, criterion=self.criterion, mask=mask, centre=centre), self.levels)
+    @property
+    def learns(self) -> bool:
+        """Whether its templates may become others."""
+        return self.rounds != (1, 0)
+
+    def _prepared(self, state: Mapping[str, Tensor]) -> list[Reference]:
+        """Every level of the templates in a ``state``."""
+        template, mask, centre = (state[name] for name in Crop._fields)
+        reference = prepare(template, criterion=self.criterion, mask=mask, centre=centre, noise=noise_left(state))
+        references = pyramid(told(reference, state), self.levels)
         if len(references) < self.levels:
             raise ValueError(f"levels: expected at most {len(references)} for these templates, got {self.levels}")
         return references
@@ -168,6 +190,17 @@ class Tracker(nn.Module):
         self._recovery = Recovery(self.references[0], self.settings, budget, self.max_step)
         alone = len(self.start) == 1 or self.frame_shape[0] > 1
         self._crowd = None if alone else Crowd(self.start[:, :2])
+        if self.learns:
+            self._teacher = Teacher(self.criterion, self.settings.interpolation, self.rounds, self.frame_mask)
+            self._version = self.template._version
+
+    def _learned(self, image: Tensor, estimate: Estimate, suspects: list[bool]) -> Estimate:
+        """The ``estimate`` of an ``image``, from which the templates have learned."""
+        if self.learns:
+            new = self._teacher(image, estimate, suspects, self._buffers)
+            if len(new) > 0:
+                self._use(renewed(self.references, new, self._buffers, self._prepared))
+        return estimate
 
     def __setattr__(self, name: str, value: Any) -> None:
         """What is assigned to a part of the state, ``tracker.pose = pose``, is written into it."""
@@ -196,13 +229,14 @@ class Tracker(nn.Module):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._buffers = {name: part.clone() if part.is_inference() else part for name, part in self._buffers.items()}
-        self._use(self._prepared(self.template, self.mask, self.centre))
+        self._use(self._prepared(self._buffers))
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a state is of, beside its tensors: a part of ``state_dict``."""
         size = [n - 2 * MARGIN for n in self.template.shape[2:]]
         given = {"templates": len(self.template), "size": size, "frame": list(self.frame_shape)}
-        return {**given, "levels": self.levels, "criterion": _named(self.criterion)}
+        learning = {"average": self.rounds[0], "renew": self.rounds[1]}
+        return {**given, **learning, "levels": self.levels, "criterion": named(self.criterion)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Refuses the state of another kind of tracker."""
@@ -219,17 +253,17 @@ class Tracker(nn.Module):
 
     def _fitting(self, state: dict[str, Any]) -> list[Reference]:
         """The templates of a ``state``, prepared. ValueError if it is not whole or does not fit."""
+        self.set_extra_state(state["_extra_state"] or self.get_extra_state())
         missing = [name for name, value in state.items() if value is None]
         if missing:
             raise ValueError(f"load_state_dict: a tracker's state must be whole, got one without {', '.join(missing)}")
-        self.set_extra_state(state["_extra_state"])
         for name, part in self._buffers.items():
             value = require_tensor("load_state_dict", name, state[name])
             if value.shape != part.shape:
                 raise ValueError(f"load_state_dict: {name} must be {tuple(part.shape)}, got {tuple(value.shape)}")
             if not bool(value.isfinite().all()):
                 raise ValueError(f"load_state_dict: {name} must be finite")
-        return self._prepared(*(state[name].to(self._buffers[name]) for name in Crop._fields))
+        return self._prepared({name: state[name].to(part) for name, part in self._buffers.items()})
 
     @plain
     @torch.no_grad()
@@ -246,6 +280,8 @@ class Tracker(nn.Module):
         image = as_image("track", "frame", frame, state["pose"].device)
         if image.shape != self.frame_shape:
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
+        if self.learns and self.template._version != self._version:  # by another handle of the same state
+            self._use(self._prepared(self._buffers))
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image]
         state["credit"].add_(self.income)
@@ -258,8 +294,9 @@ class Tracker(nn.Module):
             estimate = disbelieved(estimate, suspects, start, past, self.references[0].place.radius)
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
         if not doubtful and apart is estimate:
-            return advanced(state, estimate)
-        return advanced_in_doubt(state, apart, suspect(apart, state["score"]))
+            return self._learned(image, advanced(state, estimate), [False] * len(start))
+        suspects = suspect(apart, state["score"])
+        return self._learned(image, advanced_in_doubt(state, apart, suspects), suspects)
 
     def _within_reach(self, estimate: Estimate) -> Estimate:
         """The ``estimate`` in which those are lost that are farther from their last pose than ``max_step`` allows."""
@@ -349,24 +386,12 @@ def _warn_of_textureless(each: list[bool]) -> None:
     which = [r for r, textureless in enumerate(each) if textureless]
     if which:
         names = f"template {which[0]}" if len(which) == 1 else f"templates {', '.join(map(str, which))}"
-        warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=6)
-
-
-def _named(criterion: Criterion) -> str:
-    """What tells a criterion, in another process too: its own words if it has some, or its class."""
-    kind = type(criterion)
-    return f"{kind.__module__}.{kind.__qualname__}" if kind.__repr__ is object.__repr__ else repr(criterion)
+        warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=7)
 
 
 def _check_prediction(prediction: str) -> None:
     if prediction not in PREDICTIONS:
         raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
-
-
-def _check_levels(levels: int, size: tuple[int, int]) -> None:
-    most = max((min(size) // SMALLEST_COARSE).bit_length(), 1)
-    if not isinstance(levels, int) or not 1 <= levels <= most:
-        raise ValueError(f"levels: expected 1 to {most} for templates of {size[1]}x{size[0]} px, got {levels}")
 
 
 def _words(shape: tuple[int, ...]) -> str:

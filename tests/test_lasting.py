@@ -1,0 +1,173 @@
+"""Laws of templates that learn: a mean is less noisy, a surface that changes is followed, a cover is not learned, and
+nothing adds up."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torch_ecc import Status, Tracker
+from torch_ecc.core.reference import MARGIN
+from torch_ecc.sim import PlaneWaves
+from torch_ecc.track.lessons import Lessons
+
+FRAME, SIZE = (110, 120), 61
+START = (60.0, 54.0)
+
+
+def path(count: int) -> Tensor:
+    """Poses (F, 3) that never lie alike between pixels, upright on a whole pixel at first."""
+    swing = (math.tau * torch.arange(count, dtype=torch.float64) / 23).sin()
+    return torch.stack((START[0] + 5.3 * swing, START[1] - 3.7 * swing, math.radians(2) * swing), -1)
+
+
+def noisy(image: Tensor, number: int, noise: float) -> Tensor:
+    """A frame (h, w) of (1, 1, h, w)."""
+    return (image + noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(number)))[0, 0]
+
+
+def film(count: int, noise: float, lost: float = 0.0, seed: int = 3) -> list[Tensor]:
+    """Frames of a surface that loses a share of its texture in each, and gets other texture for it."""
+    old, new = PlaneWaves.random(seed=seed), PlaneWaves.random(seed=seed + 50)
+    images = []
+    for k, pose in enumerate(path(count)):
+        share = min(k * lost, 1.0)
+        image = (1 - share) * old.render(pose[None], FRAME)
+        images.append(noisy(image if share == 0 else image + share * new.render(pose[None], FRAME), k, noise))
+    return images
+
+
+def tracked(frames: list[Tensor], **options) -> tuple[Tracker, Tensor, Tensor]:
+    """The tracker, its errors (F - 1, 3) and their sigma."""
+    tracker = Tracker(frames[0], [START], SIZE, **{"search": False, **options})
+    track = tracker.track_sequence(frames[1:])
+    assert bool((track.status == Status.CONVERGED).all())
+    return tracker, track.pose[:, 0] - path(len(frames))[1:], track.sigma[:, 0]
+
+
+@pytest.mark.parametrize("backend", ["native", "torch"])
+def test_a_mean_of_frames_is_as_much_less_noisy(backend: str) -> None:
+    """Nine frames leave a third of the noise."""
+    frames = film(60, 10.0)
+    tracker, error, sigma = tracked(frames, average=9, backend=backend)
+    clean = PlaneWaves.random(seed=3).render(path(1), FRAME)[0, 0]
+    x, y, half = int(START[0]), int(START[1]), SIZE // 2
+    there = clean[y - half : y + half + 1, x - half : x + half + 1] - 128
+    left = tracker.template[0, 0, MARGIN:-MARGIN, MARGIN:-MARGIN] - 128 - there
+    assert 2.5 < float((left - there * (left * there).mean() / there.square().mean()).std()) < 3.8
+    assert float(tracker.lesson_frames) == 9
+    assert float((error / sigma).square().mean().sqrt()) < 1.6
+
+
+def test_a_surface_that_changes_is_followed() -> None:
+    """Within what sigma says; what follows only the first frame loses it."""
+    frames = film(100, 2.0, 1 / 80)
+    tracker, error, sigma = tracked(frames, renew=5)
+    assert float((error / sigma).square().mean().sqrt()) < 2.5
+    assert float(error[:, :2].abs().max()) < 0.25
+    assert float(sigma[-1, 0]) > 3 * float(sigma[0, 0])
+    alone = Tracker(frames[0], [START], SIZE, search=False).track_sequence(frames[1:])
+    assert bool((alone.status == Status.LOST).any())
+    assert int(tracker.lesson_rounds) == 20
+
+
+def test_what_does_not_change_stays_where_it_is() -> None:
+    """Forty times anew, and not a thousandth of a pixel off on average."""
+    still = PlaneWaves.random(seed=4).render(path(1), FRAME)
+    tracker = Tracker(noisy(still, 0, 2.0), [START], SIZE, renew=5)
+    pose = torch.stack([tracker(noisy(still, k, 2.0)).pose[0] for k in range(1, 201)])
+    assert int(tracker.lesson_rounds) == 40
+    drift = pose[100:].mean(0) - pose[5:105].mean(0)
+    assert float(drift[:2].abs().max()) < 2e-3
+    assert not bool(tracker.lesson_origin.equal(tracker.template))
+
+
+@pytest.mark.parametrize("level", [0.0, 240.0])
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_cover_is_not_learned(level: float, moving: bool) -> None:
+    """A strip that lies over it for three rounds leaves the template as it was beneath."""
+    frames = film(60, 2.0) if moving else [film(1, 2.0)[0]] * 60
+    for k, frame in enumerate(frames):
+        if 12 <= k < 48:
+            frames[k] = frame.clone()
+            frames[k][50:57, 20:95] = level
+    tracker = Tracker(frames[0], [START], SIZE, renew=10)
+    before = tracker.template.clone()
+    track = tracker.track_sequence(frames[1:])
+    assert int(tracker.lesson_rounds) >= 3
+    assert bool((track.status == Status.CONVERGED).all())
+    changed = (tracker.template - before)[0, 0, MARGIN:-MARGIN, MARGIN:-MARGIN]
+    assert float(changed.abs().max()) < 12  # its contrast is 40, that of the strip 100
+
+
+def test_a_cover_that_creeps_is_not_learned() -> None:
+    """Half a pixel per frame."""
+    frames = [frame.clone() for frame in film(60, 2.0)]
+    for k in range(10, 60):
+        frames[k][:, 28 : 28 + (k - 10) // 2] = 30.0
+    tracker = Tracker(frames[0], [START], SIZE, renew=10)
+    before = tracker.template.clone()
+    tracker.track_sequence(frames[1:])
+    assert float((tracker.template - before)[..., MARGIN:-MARGIN, MARGIN:-MARGIN].abs().max()) < 20
+
+
+@pytest.mark.parametrize("criterion", ["ecc", "ecc_paper"])
+def test_light_is_not_learned(criterion: str) -> None:
+    """Frames of another gain and offset each: the mean is in the first frame's light."""
+    frames = [(0.7 + 0.05 * (k % 9)) * frame + k % 7 for k, frame in enumerate(film(10, 1.0))]
+    tracker = Tracker(frames[0], [START], SIZE, average=10, criterion=criterion)
+    before = tracker.template.clone()
+    tracker.track_sequence(frames[1:])
+    assert int(tracker.lesson_rounds) == 1
+    assert float((tracker.template - before).std()) < 1.3
+
+
+def test_each_template_learns_by_itself() -> None:
+    """One that is covered waits; the other does not, and both are what they would be alone."""
+    frames = [frame.clone() for frame in film(9, 2.0)]
+    for k in range(2, 5):
+        frames[k][:, 62:] = 100.0
+    places = [(40.0, 50.0), (80.0, 56.0)]
+    both = Tracker(frames[0], places, 31, average=6, search=False)
+    alone = [Tracker(frames[0], [place], 31, average=6, search=False) for place in places]
+    for tracker in (both, *alone):
+        tracker.track_sequence(frames[1:])
+    assert both.lesson_rounds.tolist() == [1, 1]
+    for r, tracker in enumerate(alone):
+        torch.testing.assert_close(both.template[r], tracker.template[0], atol=1e-3, rtol=0)
+
+
+def test_another_handle_of_the_state_follows() -> None:
+    """What one handle has learned, the other tracks with."""
+    frames = film(8, 2.0)
+    tracker = Tracker(frames[0], [START], SIZE, average=4)
+    handle = copy.copy(tracker)
+    tracker.track_sequence(frames[1:6])
+    twin = copy.deepcopy(tracker)
+    assert torch.equal(handle(frames[6]).pose, twin(frames[6]).pose)
+    assert float(handle.references[0].noise.frames) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"average": 0}, "average: expected a whole number of frames from 1 on, got 0"),
+        ({"average": 2.5}, "average: expected a whole number of frames from 1 on, got 2.5"),
+        ({"average": True}, "average: expected a whole number of frames from 1 on, got True"),
+        ({"renew": 1}, "renew: expected a whole number of frames from 2 on, got 1"),
+    ],
+)
+def test_numbers_of_frames_are_refused(options: dict, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        Tracker(film(1, 2.0)[0], [START], SIZE, **options)
+
+
+def test_who_learns_nothing_holds_nothing() -> None:
+    """A tracker that is not told to learn has no such state."""
+    names = dict(Tracker(film(1, 2.0)[0], [START], SIZE).named_buffers())
+    assert not any(name.startswith("lesson") for name in names)
+    assert len(Lessons._fields) == 11

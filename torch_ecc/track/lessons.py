@@ -1,0 +1,235 @@
+"""Templates that last: the first one as the mean of some frames, and made anew, slowly, of surfaces that change.
+
+A template that follows its surface must not drift off it. Every new one is the mean of frames placed by the last one,
+and is then put where the first mean has it, or, once their textures have become too unlike, where an anchor in between
+has it: nothing adds up but what the surface itself has lost. How much that is, the first mean tells, for as long as it
+is like the last one at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.ambient import lasting
+from torch_ecc.core.criteria import Criterion
+from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.core.patches import Crop
+from torch_ecc.core.pose import compose, rotation
+from torch_ecc.core.pose import inverse as inverse_pose
+from torch_ecc.core.reference import Reference, each
+from torch_ecc.core.sampling import SAMPLERS, inside, make_sampler
+from torch_ecc.core.sight import eroded, picked
+from torch_ecc.track.surface import Comparison, Surface, compare, news, pixels, with_contrast
+
+HIGH = 0.75  # coverage: with less a frame teaches nothing
+SHARE = 0.5  # of a round's frames must have shown a pixel: else it stays what it was
+ALIKE = 0.9  # correlation: a template less like its anchor is the next anchor
+UNLIKE = 0.2  # correlation: the first mean tells nothing of a template less like it
+FEWEST = 2  # frames of a round
+SOME = 5.0  # renewals over which what they have corrected is averaged
+
+
+State: TypeAlias = Mapping[str, Tensor]
+
+
+class Lessons(NamedTuple):
+    """What R templates learn, written in place: what the frames of this round have shown ``fresh`` in every pixel, its
+    sum, and ``times`` (R, 1, h, w) each, how many frames; how many ``learned`` (R,) from in this round, and how many
+    ``rounds`` (R,) there have been; the template's ``noise`` (R,) at first, and of how many ``frames`` (R,) it is the
+    mean now; the first mean, the ``origin``, and the ``anchor``, (R, 1, h, w) each; covariances (R, 3, 3), in the
+    template's axes, of the ``origin_place``, the template's own, ``place``, and what renewals have corrected, ``lag``.
+    """
+
+    fresh: Tensor
+    times: Tensor
+    learned: Tensor
+    rounds: Tensor
+    noise: Tensor
+    frames: Tensor
+    origin: Tensor
+    anchor: Tensor
+    origin_place: Tensor
+    place: Tensor
+    lag: Tensor
+
+    @staticmethod
+    def begin(template: Tensor, noise: Tensor, pose: Tensor) -> dict[str, Tensor]:
+        """Those of templates (R, 1, h, w) that are one frame's with ``noise`` (R,), at ``pose`` (R, 3), by their names
+        in the state of a tracker: that frame has been the first lesson."""
+        none, one, place = torch.zeros_like(template), torch.ones_like(pose[:, 0]), pose.new_zeros(len(pose), 3, 3)
+        images = none, torch.ones_like(template)
+        counts = one.long(), torch.zeros_like(one).long()
+        places = (place.clone() for _ in range(3))
+        values = *images, *counts, noise.clone(), one.clone(), template.clone(), template.clone(), *places
+        return dict(zip(LESSONS, values, strict=True))
+
+
+LESSONS = tuple(f"lesson_{name}" for name in Lessons._fields)  # their names in the state of a tracker
+
+
+def lessons_in(state: State) -> Lessons | None:
+    """Those in the ``state`` of a tracker, None if it does not learn."""
+    return Lessons(*(state[name] for name in LESSONS)) if LESSONS[0] in state else None
+
+
+def noise_left(state: State) -> Tensor | None:
+    """The noise (R,) of the templates in a ``state``, grey levels, None if nothing is known of it."""
+    lessons = lessons_in(state)
+    return None if lessons is None else lessons.noise / lessons.frames.sqrt()
+
+
+def told(reference: Reference, state: State) -> Reference:
+    """A ``reference`` of the templates in a ``state`` that knows what they are worth."""
+    lessons = lessons_in(state)
+    if lessons is None:
+        return reference
+    noise = reference.noise._replace(frames=lessons.frames.clone(), place=lessons.place + lessons.lag)
+    return reference._replace(noise=noise)
+
+
+def renewed(
+    references: list[Reference], which: Tensor, state: State, prepared: Callable[[State], list[Reference]]
+) -> list[Reference]:
+    """The levels with those templates of a ``state`` ``prepared`` anew that have become others, at ``which`` (n,)."""
+    mask = state["mask"]
+    if not bool((mask == mask[:1]).all()):  # they share the pixels that any of them counts
+        return prepared(state)
+    new = prepared({name: state[name][which] for name in (*Crop._fields, *LESSONS)})
+    pairs = zip(references, new, strict=True)
+    return [each(lambda old, part: old.index_copy(0, which, part), *pair) for pair in pairs]
+
+
+def as_rounds(average: int, renew: int | None) -> tuple[int, int]:
+    """How many frames the first lesson takes and each later one, 0 for none. ValueError for what is no such number."""
+    if not isinstance(average, int) or isinstance(average, bool) or average < 1:
+        raise ValueError(f"average: expected a whole number of frames from 1 on, got {average!r}")
+    if renew is None:
+        return average, 0
+    if not isinstance(renew, int) or isinstance(renew, bool) or renew < FEWEST:
+        raise ValueError(f"renew: expected a whole number of frames from {FEWEST} on, got {renew!r}")
+    return average if average > 1 else renew, renew
+
+
+class Teacher:
+    """Of one tracker: what it makes of frames, and when, in ``rounds`` of ``as_rounds``. ``shown`` (H, W): where the
+    camera shows the scene."""
+
+    def __init__(self, criterion: Criterion, interpolation: str, rounds: tuple[int, int], shown: Tensor | None) -> None:
+        self.criterion, self.rounds = criterion, rounds
+        self.interpolation = interpolation if SAMPLERS[interpolation].ring else "bspline3"
+        self.shown = None if shown is None else eroded(shown)
+        self.surface: Surface | None = None  # of the templates as they are
+
+    @lasting
+    def __call__(self, image: Tensor, estimate: Estimate, suspects: list[bool], state: State) -> Tensor:
+        """Learn from an ``image`` (1 or R, 1, H, W); which templates (n,) have become others, in the ``state``. Frames
+        in which one is suspect teach it nothing."""
+        (first, later), crop, lessons = self.rounds, Crop(*(state[name] for name in Crop._fields)), lessons_in(state)
+        if lessons is None:
+            return torch.empty(0, dtype=torch.long)
+        usual = ~torch.tensor(suspects, device=lessons.place.device)
+        lengths = torch.where(lessons.rounds == 0, first, later)
+        right = (estimate.status == Status.CONVERGED) & (estimate.origin == Origin.TRACKED)
+        which = (right & usual & (estimate.coverage >= HIGH) & (lengths > 0)).nonzero()[:, 0]
+        if len(which) == 0:
+            return which
+        self.learn(image if len(image) == 1 else image[which], estimate.pose[which], which, crop, lessons)
+        done = which[lessons.learned[which] >= lengths[which]]
+        if len(done) > 0:
+            self.renew(done, crop, lessons)
+        return done
+
+    def learn(self, image: Tensor, pose: Tensor, which: Tensor, crop: Crop, lessons: Lessons) -> None:
+        """What the templates at ``which`` (n,) show at ``pose`` (n, 3)."""
+        if self.surface is None:
+            self.surface = Surface.of(self.criterion, *crop)
+        part = self.surface if len(which) == len(crop.mask) else self.surface.select(which)
+        g, warp, grid = sampled(image.float(), self.interpolation, pose, crop.template, crop.centre[which])
+        seen = inside(warp, grid, image.shape[2:])
+        if self.shown is not None:
+            seen &= picked(self.shown, warp, grid)
+        fresh, own = news(self.criterion, part, g, seen)
+        for total, value in ((lessons.fresh, fresh), (lessons.times, own)):
+            total.index_add_(0, which, part.images(value[:, None].to(total)))
+        lessons.learned.index_add_(0, which, torch.ones_like(which))
+
+    def renew(self, which: Tensor, crop: Crop, lessons: Lessons) -> None:
+        """A round of the templates at ``which`` (n,) is over."""
+        old, times = crop.template[which], lessons.times[which]
+        enough = times >= SHARE * lessons.learned[which, None, None, None]
+        mean = old + lessons.fresh[which] / times.clamp(min=1)
+        if self.surface is not None and self.surface.columns.shape[1] > 3:
+            # A gain by least squares is too small by the template's noise, and round after round that would add up.
+            mean = with_contrast(mean, old, crop.mask[which] * enough)
+        later = lessons.rounds[which] > 0
+        if bool(later.any()):
+            moved = self.anchored(which, torch.where(enough, mean, old), enough, crop, lessons)
+            mean = torch.where(later[:, None, None, None], moved, mean)
+        new = torch.where(enough, mean, old)
+        crop.template[which] = new
+        for image in (lessons.origin, lessons.anchor):
+            image[which] = torch.where(later[:, None, None, None], image[which], new)
+        lessons.frames[which] = lessons.learned[which].to(lessons.frames)
+        lessons.rounds[which] += 1
+        for counted in (lessons.fresh, lessons.times, lessons.learned):
+            counted[which] = 0
+        self.surface = None
+
+    def anchored(self, which: Tensor, mean: Tensor, enough: Tensor, crop: Crop, lessons: Lessons) -> Tensor:
+        """New means (n, 1, h, w) of the templates at ``which`` (n,), put where the first ones or their anchors are."""
+        first, near = (self.compared(k, mean, enough, which, crop, lessons) for k in (lessons.origin, lessons.anchor))
+        alike = first.correlation >= ALIKE
+        step = torch.where(alike[:, None], first.step, near.step).nan_to_num(0.0, 0.0, 0.0)
+        moved = shifted(mean, self.interpolation, step, crop.centre[which])
+        anchor = torch.where((near.correlation < ALIKE)[:, None, None, None], moved, lessons.anchor[which])
+        lessons.anchor[which] = torch.where(alike[:, None, None, None], lessons.origin[which], anchor)
+        self.trust(which, first, step, lessons)
+        gone = which[first.correlation < UNLIKE]  # from now on the anchor is what there is
+        lessons.origin[gone], lessons.origin_place[gone] = moved[first.correlation < UNLIKE], lessons.place[gone]
+        lessons.anchor[gone] = lessons.origin[gone]
+        return moved
+
+    def compared(
+        self, image: Tensor, mean: Tensor, enough: Tensor, which: Tensor, crop: Crop, lessons: Lessons
+    ) -> Comparison:
+        """New means (n, 1, h, w) with an older ``image`` (R, 1, h, w) of the templates at ``which`` (n,)."""
+        surface = Surface.of(self.criterion, image[which], crop.mask[which], crop.centre[which])
+        noise = 2 * lessons.noise[which].square() / lessons.learned[which]  # theirs and these
+        return compare(self.criterion, surface, mean.flatten(1), enough.flatten(1), noise)
+
+    def trust(self, which: Tensor, first: Comparison, step: Tensor, lessons: Lessons) -> None:
+        """What is known of the places of the templates at ``which`` (n,) after a ``step`` (n, 3).
+
+        The share of its texture that is the ``first`` one's is the cosine of an angle, what is new its sine. The way
+        by anchors is as long as the angle: so much more than what the sine feigns.
+        """
+        angle = first.correlation.clamp(0, 1).arccos()
+        longer = torch.where(angle > 0.1, angle / angle.sin(), 1.0)[:, None, None]
+        place = lessons.origin_place[which] + longer.square() * first.covariance
+        known = place.isfinite().all(2, keepdim=True).all(1, keepdim=True)
+        lessons.place[which] = torch.where(known, place, lessons.place[which])
+        share = 1 / lessons.rounds[which].clamp(max=SOME)[:, None, None]
+        lessons.lag[which] = torch.lerp(lessons.lag[which], step[:, :, None] * step[:, None], share.to(step))
+
+
+def sampled(
+    image: Tensor, interpolation: str, pose: Tensor, template: Tensor, centre: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What an ``image`` (1 or n, 1, H, W) shows at ``pose`` (n, 3) of the pixels (3, N) of ``template`` (R, 1, h, w)
+    about the ``centre`` (n, 2), (n, N), the warps (n, 2, 3) there, and the pixels."""
+    grid, turn = pixels(template), rotation(pose[:, 2])
+    warp = torch.cat((turn, pose[:, :2, None] - turn @ centre.to(pose)[:, :, None]), 2)
+    box = torch.stack((grid[:, 0], grid[:, template.shape[3] - 1], grid[:, -1], grid[:, -template.shape[3]]), 1)
+    return make_sampler(interpolation, image, warp, box)(warp, grid), warp, grid
+
+
+def shifted(mean: Tensor, interpolation: str, step: Tensor, centre: Tensor) -> Tensor:
+    """Images ``mean`` (n, 1, h, w), of a pose that is off by ``step`` (n, 3) about the ``centre`` (n, 2), put right."""
+    h, w = mean.shape[2:]
+    middle = step.new_tensor(((w - 1) / 2, (h - 1) / 2, 0)) + torch.nn.functional.pad(centre.to(step), (0, 1))
+    pose = compose(middle, inverse_pose(step))
+    return sampled(mean, interpolation, pose, mean, centre)[0].view_as(mean)
