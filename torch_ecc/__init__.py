@@ -2,7 +2,8 @@
 
 ``Tracker`` follows patches through a video; ``prepare`` and ``align`` are the pure functions under it; ``locate``
 finds a patch anywhere, at any angle; ``texture`` judges it beforehand; ``stabilise`` warps frames back onto the first;
-``Calibration`` turns pixels into micrometres. Conventions: see ``torch_ecc.pose``.
+``Body`` makes one pose of many patches, behind a ``Lens``; ``Calibration`` turns pixels into micrometres. Conventions:
+see ``torch_ecc.pose``.
 
 Names are fetched when they are first used: ``import torch_ecc`` alone does not even bring torch.
 """
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors read; the same places as below
     from torch_ecc.body.body import Body, BodyEstimate
     from torch_ecc.body.calibrate import SelfCalibration, calibrate
+    from torch_ecc.body.centre import RotationCentre, rotation_centre
+    from torch_ecc.body.grouping import Groups, rigid_groups
     from torch_ecc.core import pose
     from torch_ecc.core.align import align
     from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
@@ -31,6 +34,8 @@ __version__ = "0.1.0"
 _PLACES = {
     "body.body": ["Body", "BodyEstimate"],
     "body.calibrate": ["SelfCalibration", "calibrate"],
+    "body.centre": ["RotationCentre", "rotation_centre"],
+    "body.grouping": ["Groups", "rigid_groups"],
     "core.pose": ["pose"],
     "core.align": ["align"],
     "core.criteria": ["ECC", "SSD", "Criterion", "PaperECC"],
@@ -54,6 +59,7 @@ __all__ = [
     "CalibrationFit",
     "Criterion",
     "Estimate",
+    "Groups",
     "Lens",
     "Located",
     "Locator",
@@ -61,6 +67,7 @@ __all__ = [
     "PaperECC",
     "Reason",
     "Reference",
+    "RotationCentre",
     "SelfCalibration",
     "SequenceError",
     "Status",
@@ -71,6 +78,8 @@ __all__ = [
     "locate",
     "pose",
     "prepare",
+    "rigid_groups",
+    "rotation_centre",
     "stabilise",
     "suggest_frame_mask",
     "texture",
