@@ -1,9 +1,9 @@
 """Planar pose tracking (x, y, theta) of textured patches, to a thousandth of a pixel, with an honest uncertainty.
 
 ``Tracker`` follows patches through a video; ``prepare`` and ``align`` are the pure functions under it; ``locate``
-finds a patch anywhere, at any angle; ``texture`` judges it beforehand, ``texture_map`` every place of a frame;
-``stabilise`` warps frames back onto the first; ``batch`` tracks many recordings; ``Calibration`` turns pixels into
-micrometres. Conventions: see ``torch_ecc.pose``.
+finds a patch anywhere, at any angle; ``texture`` judges it beforehand, ``texture_map`` every place of a frame; ``Body``
+makes one pose of many patches, behind a ``Lens``; ``stabilise`` warps frames back onto the first; ``batch`` tracks many
+recordings; ``Calibration`` turns pixels into micrometres. Conventions: see ``torch_ecc.pose``.
 
 Names are fetched when they are first used: ``import torch_ecc`` alone does not even bring torch.
 """
@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors read; the same places as below
     from torch_ecc.body.body import Body, BodyEstimate
     from torch_ecc.body.calibrate import SelfCalibration, calibrate
+    from torch_ecc.body.centre import RotationCentre, rotation_centre
+    from torch_ecc.body.grouping import Groups, rigid_groups
     from torch_ecc.commands.batch import Batch, batch
     from torch_ecc.core import pose
     from torch_ecc.core.align import align
@@ -34,6 +36,8 @@ __version__ = "0.1.0"
 _PLACES = {
     "body.body": ["Body", "BodyEstimate"],
     "body.calibrate": ["SelfCalibration", "calibrate"],
+    "body.centre": ["RotationCentre", "rotation_centre"],
+    "body.grouping": ["Groups", "rigid_groups"],
     "commands.batch": ["Batch", "batch"],
     "core.pose": ["pose"],
     "core.align": ["align"],
@@ -60,6 +64,7 @@ __all__ = [
     "CalibrationFit",
     "Criterion",
     "Estimate",
+    "Groups",
     "Lens",
     "Located",
     "Locator",
@@ -67,6 +72,7 @@ __all__ = [
     "PaperECC",
     "Reason",
     "Reference",
+    "RotationCentre",
     "SelfCalibration",
     "SequenceError",
     "Status",
@@ -79,6 +85,8 @@ __all__ = [
     "locate",
     "pose",
     "prepare",
+    "rigid_groups",
+    "rotation_centre",
     "stabilise",
     "suggest_frame_mask",
     "texture",

@@ -1,0 +1,184 @@
+"""Which patches move together: rigid motions over all frames, not over the last one.
+
+The motion of the frame that a patch says by itself explains, or does not, where another patch is in every frame. The
+motion that explains most is refitted to what it explains, which is a body; then the next one is sought among the rest.
+In the end all bodies compete for all patches. What stands still needs no hypothesis, and is a body beside the others.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.body.fusion import fuse
+from torch_ecc.body.layout import Layout, wrapped
+from torch_ecc.core.ambient import plain
+from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.pose import compose, inverse, transform
+
+MOST = 60  # frames, evenly spread, that are compared
+FEWEST_FRAMES = 3  # in which a patch was found
+FEWEST = 2  # patches of a body
+SLACK = (0.05, 0.004)  # px, rad: errors of real patches that their covariances do not know, as of light and edges,
+RELATIVE = 0.03  # and share of the way that patches have gone: lenses, and heights, show some of them larger
+EXPLAINED = 8.0  # mean of squared distances, two components of which would be chance
+FARTHEST = 60.0  # squared distances count so much at most: a frame that went wrong is no other body
+ROUNDS = 6
+AT_ONCE = 16  # hypotheses
+
+
+class Groups(NamedTuple):
+    """``groups``: the numbers of the patches of each body, the largest one first, and what stands ``still`` last if
+    there is anything: a list each, as ``Body`` takes them; ``misfit`` (R,): the mean squared distance of each patch
+    from its body's motion, infinite for those of none."""
+
+    groups: list[list[int]]
+    still: bool
+    misfit: Tensor
+
+
+class _Seen(NamedTuple):
+    """R patches in F frames: poses (F, R, 3), covariances with slack, variances of a place and of an angle (F, R);
+    where they were found (F, R); their start (R, 3)."""
+
+    pose: Tensor
+    covariance: Tensor
+    place: Tensor
+    angle: Tensor
+    good: Tensor
+    start: Tensor
+
+
+class _Motion(NamedTuple):
+    """Motions of the frame, (F, H, 3), with the variances of their place and angle (F, H) at a point (F, H, 2), known
+    in some frames (F, H)."""
+
+    pose: Tensor
+    place: Tensor
+    angle: Tensor
+    at: Tensor
+    known: Tensor
+
+
+@plain
+@torch.no_grad()
+def rigid_groups(track: Estimate, bodies: int) -> Groups:
+    """The patches of a Track (F, R, ...) grouped into so many ``bodies`` that move, or fewer if there are no more, and
+    one more that stands still if there is anything. Patches that go with none, as across an edge, are in no group.
+
+    ValueError for what is no track, and if no two patches move together.
+    """
+    if track.pose.dim() != 3:
+        raise ValueError(f"rigid_groups: track must be (F, R, ...), got {tuple(track.pose.shape)}")
+    if not isinstance(bodies, int) or bodies < 1:
+        raise ValueError(f"rigid_groups: bodies must be a whole number of at least 1, got {bodies!r}")
+    seen = _sampled(track)
+    standing = _still(seen)
+    free, found = seen.good.sum(0) >= FEWEST_FRAMES, []
+    still = int(((_misfit(seen, standing)[0] < EXPLAINED) & free).sum()) >= FEWEST
+    if still:
+        free &= _misfit(seen, standing)[0] >= EXPLAINED
+    while len(found) < bodies and int(free.sum()) >= FEWEST:
+        members = _largest(seen, free)
+        if members is None:
+            break
+        found.append(members)
+        free &= ~members
+    if not found and not still:
+        raise ValueError("rigid_groups: no two patches move together")
+    return _competing(seen, found, standing if still else None)
+
+
+def _sampled(track: Estimate) -> _Seen:
+    some = torch.linspace(0, len(track.pose) - 1, min(MOST, len(track.pose))).round().long().to(track.pose.device)
+    pose, covariance, status = track.pose[some], track.covariance[some], track.status[some]
+    good = (status == Status.CONVERGED) & covariance.isfinite().flatten(2).all(2)
+    covariance = torch.where(good[..., None, None], covariance, 0.0)
+    moved = RELATIVE * track.displacement[some]
+    way = torch.linalg.vector_norm(moved[..., :2], dim=-1)
+    slack = torch.stack((way, way, moved[..., 2]), -1).square() + pose.new_tensor((*SLACK[:1], *SLACK)).square()
+    covariance = covariance + torch.diag_embed(slack)
+    place = covariance[..., 0, 0] + covariance[..., 1, 1]
+    start = (track.pose - track.displacement)[0]
+    return _Seen(pose, covariance, place / 2, covariance[..., 2, 2], good, start)
+
+
+def _still(seen: _Seen) -> _Motion:
+    none = torch.zeros_like(seen.place[:, :1])
+    pose = torch.zeros_like(seen.pose[:, :1])
+    return _Motion(pose, none, none, pose[..., :2], torch.ones_like(seen.good[:, :1]))
+
+
+def _of_patches(seen: _Seen, index: Tensor) -> _Motion:
+    """What patches (H,) say by themselves."""
+    pose = compose(seen.pose[:, index], inverse(seen.start[index]).expand_as(seen.pose[:, index]))
+    return _Motion(pose, seen.place[:, index], seen.angle[:, index], seen.pose[:, index, :2], seen.good[:, index])
+
+
+def _of_members(seen: _Seen, members: Tensor) -> _Motion:
+    """That of a body of the patches where ``members`` (R,)."""
+    layout = Layout.of(seen.start, [members.nonzero()[:, 0].tolist()])
+    found = fuse(seen.pose, seen.covariance, seen.good & members, layout)
+    known = found.freedom >= 0
+    spread = torch.where(known[..., None, None], found.covariance, 1.0)
+    pose = compose(found.pose, inverse(layout.start).expand_as(found.pose))
+    place = (spread[..., 0, 0] + spread[..., 1, 1]) / 2
+    return _Motion(pose, place, spread[..., 2, 2], found.pose[..., :2], known)
+
+
+def _misfit(seen: _Seen, motion: _Motion) -> Tensor:
+    """How badly motions explain patches: the mean squared distance (H, R) over the frames in which both are known,
+    infinite where these are few."""
+    there = torch.cat(
+        (
+            transform(motion.pose, seen.start[:, :2]),
+            (motion.pose[..., 2:] + seen.start[:, 2])[..., None],
+        ),
+        -1,
+    )  # (F, H, R, 3)
+    off = wrapped(seen.pose[:, None] - there)
+    arm = (there[..., :2] - motion.at[:, :, None]).square().sum(-1)
+    place = seen.place[:, None] + motion.place[..., None] + arm * motion.angle[..., None]
+    angle = seen.angle[:, None] + motion.angle[..., None]
+    distance = off[..., :2].square().sum(-1) / place + off[..., 2].square() / angle
+    both = (seen.good[:, None] & motion.known[..., None]).to(distance.dtype)
+    count = both.sum(0)
+    mean = (distance.clamp(max=FARTHEST) * both).sum(0) / count.clamp(min=1)
+    return torch.where(count >= FEWEST_FRAMES, mean, torch.inf)
+
+
+def _largest(seen: _Seen, free: Tensor) -> Tensor | None:
+    """The most of the ``free`` patches (R,) that one motion explains, (R,) bool; None if there are no two."""
+    best, most = None, 0.0
+    for some in free.nonzero()[:, 0].split(AT_ONCE):
+        share = (1 - _misfit(seen, _of_patches(seen, some)) / EXPLAINED).clamp(min=0) * free
+        value, which = share.sum(1).max(0)
+        if float(value) > most and int((share[which] > 0).sum()) >= FEWEST:
+            best, most = share[which] > 0, float(value)
+    for _ in range(ROUNDS):
+        if best is None:
+            return None
+        again = (_misfit(seen, _of_members(seen, best))[0] < EXPLAINED) & free
+        if int(again.sum()) < FEWEST or bool((again == best).all()):
+            break
+        best = again
+    return best
+
+
+def _competing(seen: _Seen, found: list[Tensor], standing: _Motion | None) -> Groups:
+    """All bodies compete for all patches, and each is what it has got, until nothing changes."""
+    usable, last = seen.good.sum(0) >= FEWEST_FRAMES, None
+    for _ in range(ROUNDS):
+        motions = [_of_members(seen, members) for members in found] + ([] if standing is None else [standing])
+        misfit, owner = torch.cat([_misfit(seen, motion) for motion in motions]).min(0)
+        owner = torch.where((misfit < EXPLAINED) & usable, owner, -1)
+        if last is not None and bool((owner == last).all()):
+            break
+        last = owner
+        found = [owner == k for k in range(len(found)) if int((owner == k).sum()) >= FEWEST]
+    groups = sorted((members.nonzero()[:, 0].tolist() for members in found), key=len, reverse=True)
+    rest = [] if standing is None else (owner == len(motions) - 1).nonzero()[:, 0].tolist()
+    inside = torch.where(owner >= 0, misfit, torch.inf)
+    return Groups([*groups, rest] if rest else groups, bool(rest), inside)
