@@ -6,7 +6,7 @@ import dataclasses
 import errno
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeAlias
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_ecc.commands.jobs import TrackJob, span
+from torch_ecc.commands.live import Latency, Send, sender
 from torch_ecc.commands.templates import Templates, choose_templates, read_frame_mask, read_templates, refuse_doubt
 from torch_ecc.core.ambient import threads_for
 from torch_ecc.core.estimate import Estimate, Reason, Status
@@ -33,14 +34,14 @@ Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 STATUS_NAMES = {int(code): code.name for code in Status}
 REASON_NAMES = {int(code): code.word for code in Reason}
 RESULTS = (*FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
-NOT_OF_THE_RESULT = ("out", "force", "resume")
+NOT_OF_THE_RESULT = ("out", "force", "resume", "send")
 CONSTANT = ("template", "mask", "centre", "first")  # of a tracker's state
 
 
 class Finished(NamedTuple):
     """What became of a run: ``frames`` done, of which so many ``damaged``, how many each template was lost in of the
     others and what speaks against its last pose (R,), how many rows each reason stands in, in the order of Reason, the
-    folder, and whether it was stopped from the keyboard or by a signal."""
+    folder, whether it was stopped from the keyboard or by a signal, and how late poses of a camera's frames were."""
 
     frames: int
     damaged: int
@@ -49,6 +50,7 @@ class Finished(NamedTuple):
     reasons: NDArray[np.int64]
     folder: Path
     interrupted: bool
+    latency: Latency
 
     def words(self) -> list[str]:
         """The same in sentences."""
@@ -64,6 +66,7 @@ class Finished(NamedTuple):
         if reasons := [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]:
             rows, doubted = int(self.reasons.sum()), int(self.reasons[1:].sum())
             said.append(f"{doubted} of {rows} rows are not to be trusted: {', '.join(reasons)}")
+        said += self.latency.words()
         whole = sorted(path.name for path in self.folder.iterdir() if path.suffix != ".part") if self.frames else []
         end, names = "Stopped after" if self.interrupted else "Tracked", ", ".join(whole) or "nothing"
         return [*said, f"{end} {self.frames} frames. In {self.folder}/: {names}"]
@@ -90,6 +93,9 @@ class Session:
             raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
         self.templates = choose_templates(job, first) if crops is None else Templates.of(crops)
         self.calibration = job.calibration(self.source.um_per_px)
+        self.send: Send = sender(job.send, self._um_matrix()) if job.send is not None else lambda frame, estimate: None
+        if self.source.live and job.resume:
+            raise ValueError("resume: a camera does not go back to where it was")
         centers, size, mask = self.templates
         if job.stabilise is not None and not 0 <= job.stabilise < len(centers):
             raise ValueError(f"stabilise: expected a template from 0 to {len(centers) - 1}, got {job.stabilise}")
@@ -102,6 +108,8 @@ class Session:
                 self.tracker, located = Tracker.find(crops, first, near=near, **options)
                 refuse_doubt(located, near is not None)
         self.settings = settings_of(job, first)
+        if self.source.live:
+            self.tracker(first)  # the first frame takes longer than all others, and a camera does not wait
 
     def remarks(self) -> list[str]:
         """What people should know before: what was taken from the file, and what is strange about it."""
@@ -134,10 +142,12 @@ class Session:
                 run.go_on(left.records(self.folder))
             stopped: BaseException | None = None
             try:
-                with run:
-                    frames = self._frames(left)
-                    for frame in ahead(map(with_picture, frames) if films else frames):
-                        watch(frame, run.step(frame))
+                with run, suppress(*([KeyboardInterrupt] if self.source.live else [])):  # how else would a camera end
+                    for raw in self._frames(left, pictures=bool(films)):
+                        frame, estimate = run.look(raw)
+                        self.send(frame, estimate)
+                        watch(frame, estimate)
+                        run.write(frame, estimate)
                         progress(run.done)
             except (KeyboardInterrupt, ValueError) as error:
                 stopped = error
@@ -148,7 +158,7 @@ class Session:
                 self._remove_old({film.film.name for film in films})
             if isinstance(stopped, ValueError):
                 raise stopped
-        return Finished(*run.counts, self.folder, stopped is not None)
+        return Finished(*run.counts, self.folder, stopped is not None, run.latency)
 
     def _remove_old(self, films: set[str]) -> None:
         """What a result before had and this one does not."""
@@ -171,12 +181,13 @@ class Session:
         whole = min([left.frames, *(each.film.left for each in films)])
         return left._replace(frames=whole) if whole else None
 
-    def _frames(self, left: Unfinished | None) -> Iterator[Frame]:
-        """Those that are not done yet."""
-        if left is None:
+    def _frames(self, left: Unfinished | None, *, pictures: bool) -> Iterator[Frame]:
+        """Those that are not done yet, read ahead, with their pictures if there are films; a camera's as they come."""
+        if self.source.live:
             return iter(self.source)
-        last = int(left.records(self.folder)["frame"][-1])
-        return (frame for frame in self.source if frame.number > last)
+        last = -1 if left is None else int(left.records(self.folder)["frame"][-1])
+        frames = (frame for frame in self.source if frame.number > last)
+        return ahead(map(with_picture, frames) if pictures else frames)
 
     def _track_writer(self, left: Unfinished | None) -> TrackWriter:
         """Of track.csv, track.npz and summary.json."""
@@ -218,6 +229,7 @@ class _Run:
 
     def __init__(self, tracker: Tracker, track: TrackWriter, films: list[Pictures], *, stop_at_damage: bool) -> None:
         self.tracker, self.track, self.films, self.stop_at_damage = tracker, track, films, stop_at_damage
+        self.latency = Latency()
         self.done, self.damaged, self.reasons = 0, 0, np.zeros(len(Reason), np.int64)
         self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
         # What the next frame depends on: all of it goes into the journal with every frame.
@@ -235,8 +247,8 @@ class _Run:
     def __exit__(self, *error: Any) -> None:
         self._open.__exit__(*error)
 
-    def step(self, frame: Frame) -> Estimate:
-        """One frame more, and what was found in it. ValueError for one that is damaged, if that is to be the end."""
+    def look(self, frame: Frame) -> tuple[Frame, Estimate]:
+        """What is found in one frame more, which may turn out to be damaged. ValueError if that is to be the end."""
         try:
             if frame.pixels is None:
                 raise ValueError(frame.damage)
@@ -244,13 +256,17 @@ class _Run:
         except ValueError as error:
             if self.stop_at_damage:
                 raise ValueError(f"frame {frame.number}: {error}") from error
-            frame, estimate = dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
+            return dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
+        self.latency.add(frame)
+        return frame, estimate
+
+    def write(self, frame: Frame, estimate: Estimate) -> None:
+        """Append what was found in a frame to all files."""
         views = self._views or [part.cpu().numpy() for part in self._state]
         self.track.write(estimate, frame, b"".join(view.tobytes() for view in views))
         for film in self.films:
             film.write(frame, estimate)
         self._count(*(code.cpu().numpy()[None] for code in (estimate.status, estimate.reason)))
-        return estimate
 
     @property
     def counts(self) -> tuple[int, int, NDArray[np.int64], NDArray[np.int8], NDArray[np.int64]]:
