@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import threading
 import tracemalloc
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torch_ecc.io import Frame, FrameError, FrameSource, open_frames
+from torch_ecc.io import Frame, FrameError, FrameSource, live, open_frames
 
 DTYPES = [np.uint8, np.uint16, np.float32]
 F, H, W = 12, 10, 14
@@ -318,9 +319,10 @@ def test_video_is_rgb(tmp_path):
 
 
 class FakeCamera:
-    """A camera that counts upwards and breaks at its fifth frame."""
+    """A camera that counts upwards and breaks at its fifth frame; each has to be let go."""
 
     opened = 0
+    ready = threading.Semaphore(0)
 
     def __init__(self, index: int) -> None:
         self.index, self.count = index, 0
@@ -332,7 +334,11 @@ class FakeCamera:
     def get(self, _: int) -> float:
         return 30.0
 
+    def release(self) -> None:
+        pass
+
     def read(self) -> tuple[bool, np.ndarray]:
+        self.ready.acquire()
         self.count += 1
         return self.count < 5, np.full((4, 6, 3), self.count, np.uint8)
 
@@ -341,15 +347,21 @@ class FakeCamera:
 def test_camera(monkeypatch, source):
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
     monkeypatch.setattr(FakeCamera, "opened", 0)
+    monkeypatch.setattr(FakeCamera, "ready", threading.Semaphore(1))
+    live._opened.cache_clear()
     camera = open_frames(source)
     assert (camera.length, camera.fps, camera.shape) == (None, 30.0, (4, 6))
-    with pytest.raises(TypeError, match="number of frames of camera 3 is not known"):
+    with pytest.raises(TypeError, match="number of frames of opencv 3 is not known"):
         len(camera)
-    stream = iter(camera)
-    frames = [next(stream) for _ in range(4)]
-    assert [int(frame.pixels[0, 0]) for frame in frames] == [1, 2, 3, 4]
+    stream, frames = iter(camera), []
+    for _ in range(3):
+        FakeCamera.ready.release()
+        frames.append(next(stream))
+    assert [(frame.number, int(frame.pixels[0, 0])) for frame in frames] == [(0, 2), (1, 3), (2, 4)]
     assert all(a.time_s < b.time_s for a, b in pairwise(frames))
-    with pytest.raises(FrameError, match="frame 4: camera 3 delivers no frame any more"):
+    assert [frame.arrival.lost for frame in frames] == [0, 0, 0]
+    FakeCamera.ready.release()
+    with pytest.raises(FrameError, match="frame 3: camera 3 delivers no frame any more"):
         next(stream)
     assert FakeCamera.opened == 1  # opening one takes a second and resets its exposure
 
@@ -571,7 +583,7 @@ def test_bad_sources(tmp_path, source, error, message):
 @pytest.mark.parametrize(
     ("source", "error", "message"),
     [
-        (-1, ValueError, "a camera index must be 0 or more, got -1"),
+        (-1, ValueError, "camera index must be 0 or more, got -1"),
         (4, ValueError, "camera 4 cannot be opened"),
         ("", FileNotFoundError, "no such file, folder or camera: ''"),
     ],

@@ -57,7 +57,7 @@ class TrackJob(Tracking):
 
     input: str = field(
         metadata={
-            "words": "a video, a folder or glob of images, a multi-page TIFF, .npy, .npz, a camera index",
+            "words": "a video, a folder or glob of images, a multi-page TIFF, .npy, .npz, camera:KIND:WHICH",
             "example": "video.mp4",
         }
     )
@@ -99,6 +99,9 @@ class TrackJob(Tracking):
     resume: bool = described(False, "go on where a run in this folder was stopped, killed, or out of disk space")
     stop_at_damage: bool = described(False, "end at the first damaged frame, instead of going on with the next one")
     overlay: bool = described(True, "write overlay.mp4")
+    send: str | None = described(
+        None, "also send each frame's poses, as one line of JSON: - is the screen, or udp://HOST:PORT", example="-"
+    )
     stabilise: int | None = described(
         None, "write stabilised.mp4, in which this template, counted from 0, stands still", example=0
     )

@@ -6,7 +6,7 @@ import dataclasses
 import errno
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeAlias
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_ecc.commands.jobs import TrackJob, span
+from torch_ecc.commands.live import Latency, Send, sender
 from torch_ecc.commands.templates import Templates, choose_templates, read_frame_mask, read_templates, refuse_doubt
 from torch_ecc.core.ambient import threads_for
 from torch_ecc.core.estimate import Estimate, Reason, Status
@@ -35,14 +36,14 @@ Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 STATUS_NAMES = {int(code): code.name for code in Status}
 REASON_NAMES = {int(code): code.word for code in Reason}
 RESULTS = (*FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
-NOT_OF_THE_RESULT = ("out", "force", "resume")
+NOT_OF_THE_RESULT = ("out", "force", "resume", "send")
 CONSTANT = ("template", "mask", "centre", "first", *LESSONS)  # of a tracker's state, or too large for a journal
 
 
 class Finished(NamedTuple):
     """What became of a run: ``frames`` done, of which so many ``damaged``, how many each template was lost in of the
     others and what speaks against its last pose (R,), how many rows each reason stands in, in the order of Reason, the
-    folder, and whether it was stopped from the keyboard or by a signal."""
+    folder, whether it was stopped from the keyboard or by a signal, and how late poses of a camera's frames were."""
 
     frames: int
     damaged: int
@@ -51,6 +52,7 @@ class Finished(NamedTuple):
     reasons: NDArray[np.int64]
     folder: Path
     interrupted: bool
+    latency: Latency
 
     def words(self) -> list[str]:
         """The same in sentences."""
@@ -66,6 +68,7 @@ class Finished(NamedTuple):
         if reasons := [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]:
             rows, doubted = int(self.reasons.sum()), int(self.reasons[1:].sum())
             said.append(f"{doubted} of {rows} rows are not to be trusted: {', '.join(reasons)}")
+        said += self.latency.words()
         whole = sorted(path.name for path in self.folder.iterdir() if path.suffix != ".part") if self.frames else []
         end, names = "Stopped after" if self.interrupted else "Tracked", ", ".join(whole) or "nothing"
         return [*said, f"{end} {self.frames} frames. In {self.folder}/: {names}"]
@@ -93,6 +96,9 @@ class Session:
             raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
         self.templates = choose_templates(job, first) if crops is None else Templates.of(crops)
         self.calibration = job.calibration(self.source.um_per_px)
+        self.send: Send = sender(job.send, self._um_matrix()) if job.send is not None else lambda frame, estimate: None
+        if self.source.live and job.resume:
+            raise ValueError("resume: a camera does not go back to where it was")
         centers, size, mask = self.templates
         if job.stabilise is not None and not 0 <= job.stabilise < len(centers):
             raise ValueError(f"stabilise: expected a template from 0 to {len(centers) - 1}, got {job.stabilise}")
@@ -105,6 +111,8 @@ class Session:
                 self.tracker, located = Tracker.find(crops, first, near=near, **options)
                 refuse_doubt(located, near is not None)
         self.settings = settings_of(job, first)
+        if self.source.live:
+            self.tracker(first)  # the first frame takes longer than all others, and a camera does not wait
 
     def remarks(self) -> list[str]:
         """What people should know before: what was taken from the file, and what is strange about it."""
@@ -137,9 +145,8 @@ class Session:
                 run.go_on(left.records(self.folder))
             stopped: BaseException | None = None
             try:
-                with run:
-                    frames = self._frames(left)
-                    run.through(map(with_picture, frames) if films else frames, progress, watch)
+                with run, suppress(*([KeyboardInterrupt] if self.source.live else [])):  # how else would a camera end
+                    run.through(self._frames(left, pictures=bool(films)), progress, self.send, watch)
             except (KeyboardInterrupt, ValueError) as error:
                 stopped = error
             except OSError as error:
@@ -149,7 +156,7 @@ class Session:
                 self._remove_old({film.film.name for film in films})
             if isinstance(stopped, ValueError):
                 raise stopped
-        return Finished(*run.counts, self.folder, stopped is not None)
+        return Finished(*run.counts, self.folder, stopped is not None, run.latency)
 
     def run_part(self, first: int, last: int, progress: Callable[[int], None] = lambda done: None) -> None:
         """Track the frames from number ``first`` to ``last``, or those of them that the folder does not have yet, and
@@ -158,11 +165,10 @@ class Session:
             left = self._left([])
             run = _Run(self.tracker, self._track_writer(left), [], stop_at_damage=self.job.stop_at_damage)
             if left is not None:
-                records = left.records(self.folder)
-                run.go_on(records)
-                first = int(records["frame"][-1]) + 1
+                run.go_on(left.records(self.folder))
+                first = _last(left, self.folder) + 1
             try:
-                run.through(self.source.between(first, last), progress)
+                run.through(ahead(self.source.between(first, last)), progress)
             finally:
                 run.track.leave()
 
@@ -188,11 +194,12 @@ class Session:
         whole = 0 if self.tracker.learns else min([left.frames, *(each.film.left for each in films)])
         return left._replace(frames=whole) if whole else None
 
-    def _frames(self, left: Unfinished | None) -> Iterator[Frame]:
-        """Those that are not done yet."""
-        if left is None:
+    def _frames(self, left: Unfinished | None, *, pictures: bool) -> Iterator[Frame]:
+        """Those that are not done yet, read ahead, with their pictures if there are films; a camera's as they come."""
+        if self.source.live:
             return iter(self.source)
-        return self.source.between(int(left.records(self.folder)["frame"][-1]) + 1)
+        frames = iter(self.source) if left is None else self.source.between(_last(left, self.folder) + 1)
+        return ahead(map(with_picture, frames) if pictures else frames)
 
     def _track_writer(self, left: Unfinished | None) -> TrackWriter:
         """Of track.csv, track.npz and summary.json."""
@@ -234,6 +241,7 @@ class _Run:
 
     def __init__(self, tracker: Tracker, track: TrackWriter, films: list[Pictures], *, stop_at_damage: bool) -> None:
         self.tracker, self.track, self.films, self.stop_at_damage = tracker, track, films, stop_at_damage
+        self.latency = Latency()
         self.done, self.damaged, self.reasons = 0, 0, np.zeros(len(Reason), np.int64)
         self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
         # What the next frame depends on: all of it goes into the journal with every frame.
@@ -252,18 +260,18 @@ class _Run:
         self._open.__exit__(*error)
 
     def through(
-        self,
-        frames: Iterable[Frame],
-        progress: Callable[[int], None],
-        watch: Callable[[Frame, Estimate], None] = lambda frame, estimate: None,
+        self, frames: Iterable[Frame], progress: Callable[[int], None], *told: Callable[[Frame, Estimate], None]
     ) -> None:
-        """All of them; ``progress`` is told how many frames are done, ``watch`` what was found in each."""
-        for frame in ahead(frames):
-            watch(frame, self.step(frame))
+        """All of them; ``progress`` is told how many frames are done, before that each of ``told`` what was found."""
+        for raw in frames:
+            frame, estimate = self.look(raw)
+            for tell in told:
+                tell(frame, estimate)
+            self.write(frame, estimate)
             progress(self.done)
 
-    def step(self, frame: Frame) -> Estimate:
-        """One frame more, and what was found in it. ValueError for one that is damaged, if that is to be the end."""
+    def look(self, frame: Frame) -> tuple[Frame, Estimate]:
+        """What is found in one frame more, which may turn out to be damaged. ValueError if that is to be the end."""
         try:
             if frame.pixels is None:
                 raise ValueError(frame.damage)
@@ -271,13 +279,17 @@ class _Run:
         except ValueError as error:
             if self.stop_at_damage:
                 raise ValueError(f"frame {frame.number}: {error}") from error
-            frame, estimate = dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
+            return dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
+        self.latency.add(frame)
+        return frame, estimate
+
+    def write(self, frame: Frame, estimate: Estimate) -> None:
+        """Append what was found in a frame to all files."""
         views = self._views or [part.cpu().numpy() for part in self._state]
         self.track.write(estimate, frame, b"".join(view.tobytes() for view in views))
         for film in self.films:
             film.write(frame, estimate)
         self._count(*(code.cpu().numpy()[None] for code in (estimate.status, estimate.reason)))
-        return estimate
 
     @property
     def counts(self) -> tuple[int, int, NDArray[np.int64], NDArray[np.int8], NDArray[np.int64]]:
@@ -314,6 +326,11 @@ def restore(parts: list[Tensor], state: bytes) -> None:
         value = np.frombuffer(state[:size], part.cpu().numpy().dtype).reshape(tuple(part.shape))
         part.copy_(torch.from_numpy(value.copy()))
         state = state[size:]
+
+
+def _last(left: Unfinished, folder: Path) -> int:
+    """The number of the last frame that an unfinished run has done."""
+    return int(left.records(folder)["frame"][-1])
 
 
 def with_picture(frame: Frame) -> Frame:

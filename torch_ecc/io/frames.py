@@ -34,13 +34,21 @@ class FrameError(ValueError):
         self.frame = frame
 
 
+class Arrival(NamedTuple):
+    """When a live camera's frame arrived, by ``time.perf_counter``, and how many were lost since the one before."""
+
+    time_s: float
+    lost: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One frame of a source, or what is known of it if it is damaged.
 
     ``number`` counts from 0 in the source. ``pixels`` are its grey levels (H, W), uint8, uint16 or float32, in
     memory of their own; None exactly where ``damage`` says in words why there are none. ``time_s`` is its own time by
-    the source's clock, None where the source has none; ``name`` is that of its file, in a folder, and "" elsewhere.
+    the source's clock, None where the source has none; ``name`` is that of its file, in a folder, and "" elsewhere;
+    ``arrival`` is None but for live cameras.
     """
 
     number: int
@@ -49,6 +57,7 @@ class Frame:
     name: str = ""
     damage: str | None = None
     colours: Callable[[], Pixels] | None = None
+    arrival: Arrival | None = None
 
     def picture(self) -> Tensor:
         """For people: (3, H, W) RGB, or (H, W) where the source has no colours; made when it is asked for.
@@ -70,12 +79,14 @@ class Raw(NamedTuple):
     time_s: float | None = None
     name: str = ""
     colours: Callable[[], Pixels] | None = None
+    arrival: Arrival | None = None
 
 
 class Medium(NamedTuple):
     """How a source is read: ``read(numbers)`` gives the frames of these numbers, which ascend, and ends where there
     are no more. FrameError from it means that more was promised. ``length`` is ``exact`` or an estimate. ``um_per_px``
-    (x, y) and ``fps`` are None where the source does not tell; ``notes`` are sentences for people."""
+    (x, y) and ``fps`` are None where the source does not tell; ``notes`` are sentences for people. A ``live`` one does
+    not wait: reading again begins with what there is then."""
 
     read: Callable[[range], Iterator[Raw]]
     length: int | None = None
@@ -83,6 +94,7 @@ class Medium(NamedTuple):
     um_per_px: tuple[float, float] | None = None
     notes: tuple[str, ...] = ()
     exact: bool = True
+    live: bool = False
 
 
 class FrameSource:
@@ -106,7 +118,7 @@ class FrameSource:
     def __init__(self, name: str, medium: Medium, *, fps: float | None = None, numbers: range | None = None) -> None:
         self._medium, self._rate = medium, fps
         self._numbers = _numbers(medium, slice(None)) if numbers is None else numbers
-        self.name, self.notes, self.um_per_px = name, medium.notes, medium.um_per_px
+        self.name, self.notes, self.um_per_px, self.live = name, medium.notes, medium.um_per_px, medium.live
         self.fps, self.length = medium.fps if fps is None else fps, _length(medium, self._numbers)
         # Frames are read up to the first good one, for its shape, and not read again: a camera goes on.
         stream, begun = medium.read(self._numbers), []
@@ -123,7 +135,7 @@ class FrameSource:
         self.first, self._first = frame.pixels, frame.name or f"frame {frame.number}"
         self.dtype, self.shape = self.first.dtype, (self.first.shape[0], self.first.shape[1])
         self.timed, self.named = frame.time_s is not None, bool(frame.name)
-        self._opened: Iterator[Raw] | None = chain(begun, stream)
+        self._opened: Iterator[Raw] | None = None if medium.live else chain(begun, stream)
 
     def __len__(self) -> int:
         if self.length is None:
@@ -164,7 +176,7 @@ class FrameSource:
     def _frame(self, raw: Raw) -> Frame:
         """What a raw frame is by itself."""
         time_s = raw.time_s if self._rate is None else raw.number / self._rate
-        frame = Frame(raw.number, None, time_s, raw.name)
+        frame = Frame(raw.number, None, time_s, raw.name, arrival=raw.arrival)
         stored = raw.pixels
         if isinstance(stored, str):
             return replace(frame, damage=stored)

@@ -8,11 +8,12 @@ from pathlib import Path
 
 from torch_ecc.io.animation import ANIMATIONS, is_animated, open_animation
 from torch_ecc.io.axes import Choice, check_single
-from torch_ecc.io.camera import open_camera
+from torch_ecc.io.cameras.newest import Camera
 from torch_ecc.io.cine import open_cine
 from torch_ecc.io.extras import open_extra
 from torch_ecc.io.frames import FrameSource, Medium
 from torch_ecc.io.images import IMAGES, open_images
+from torch_ecc.io.live import PREFIX, medium_of, open_live
 from torch_ecc.io.stacks import Stack, open_npy, open_npz, open_stack
 from torch_ecc.io.tiff import TIFF, open_tiff
 from torch_ecc.io.video import VIDEOS, open_video
@@ -27,7 +28,7 @@ _PLAIN = {
 
 
 def open_frames(
-    source: str | Path | int | Stack,
+    source: str | Path | int | Stack | Camera,
     *,
     fps: float | None = None,
     channel: int | None = None,
@@ -39,7 +40,9 @@ def open_frames(
     A video file; an animated GIF, PNG or WebP; an image; a folder or a glob (``"run3/*.png"``) of images in the order
     of the numbers in their names; a TIFF with one time axis; an .npy stack, (F, H, W) or with 1, 3 or 4 channels, first
     or last; an .npz with such an array named ``frames`` or alone; anything indexed like such an array (numpy, dask,
-    zarr, h5py); a camera index, as a number or in digits ("0"). Frames are read when they are asked for.
+    zarr, h5py); a camera: ``camera:KIND:WHICH`` (see ``live.KINDS``), an index of OpenCV's, as a number or in digits
+    ("0"), or any object with ``grab`` (see ``cameras.newest.Camera``). Frames are read when they are asked for; of a
+    camera each is the newest one, and those in between are lost.
 
     ``fps`` in Hz: the frames' times, instead of the source's own. ``channel``, ``slice``, ``position``, from 0: which
     of them to read where a source has several; they are never taken for time. Raises FileNotFoundError where nothing
@@ -51,7 +54,9 @@ def open_frames(
     return FrameSource(name, medium, fps=fps)
 
 
-def _open(source: str | Path | int | Stack, choice: Choice) -> tuple[str, Medium]:
+def _open(source: str | Path | int | Stack | Camera, choice: Choice) -> tuple[str, Medium]:
+    if isinstance(source, Camera):
+        return "camera", medium_of(source, "camera")
     if not isinstance(source, str | Path | int):
         name = f"{type(source).__name__}"
         check_single(name, choice)
@@ -61,8 +66,10 @@ def _open(source: str | Path | int | Stack, choice: Choice) -> tuple[str, Medium
     if not isinstance(source, int) and text and path.exists():  # a folder named by digits is no camera
         return path.name or str(path), _open_path(path, choice)
     if isinstance(source, int) or (text.isascii() and text.isdecimal()):
-        check_single(f"camera {int(text)}", choice)
-        return f"camera {int(text)}", open_camera(int(text))
+        text = f"{PREFIX}opencv:{int(text)}"
+    if text.startswith(PREFIX):
+        check_single(text, choice)
+        return text.removeprefix(PREFIX).replace(":", " "), open_live(text)
     if any(wildcard in text for wildcard in "*?["):
         return _open_glob(path, choice)
     raise FileNotFoundError(f"open_frames: no such file, folder or camera: {text!r}")

@@ -5,6 +5,7 @@ from torch_ecc.servo.control import Control, Controller
 from torch_ecc.servo.detect import find
 from torch_ecc.servo.jacobian import Jacobian, StageJacobian
 from torch_ecc.servo.loop import servo
+from torch_ecc.servo.micromanager import MicroManagerStage
 from torch_ecc.servo.plant import Limits, Plant
 from torch_ecc.servo.record import Ending, Log, Result, Step, decay_rate
 
@@ -16,6 +17,7 @@ __all__ = [
     "Jacobian",
     "Limits",
     "Log",
+    "MicroManagerStage",
     "Part",
     "Plant",
     "Result",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torch_ecc.commands.jobs import TrackJob, span
 from torch_ecc.commands.options import track_command, track_toml
@@ -44,7 +45,8 @@ class Desk:
         self.history: History | None = None
         self.run: Run | None = None
         self.problem: str | None = None
-        self._map: tuple[int, TextureMap] | None = None
+        self._map: tuple[Tensor, TextureMap] | None = None
+        self.looks = 0
         try:
             self._open_result()
             self.job = fill(TrackJob, self.values, "pick")
@@ -69,7 +71,7 @@ class Desk:
         first = span(job.frames).start or 0
         part = source if first == 0 else source[first:]
         frame = part.first if job.reference is None else open_frames(job.reference).first
-        self.source, self.first, self.frame = source, first, frame
+        self.source, self.first, self.frame, self.looks = source, first, frame, self.looks + 1
 
     def _read_marks(self) -> None:
         """Those that the values bring."""
@@ -110,6 +112,8 @@ class Desk:
             "size": source.shape,
             "dtype": str(source.dtype).removeprefix("torch."),
             "length": source.length,
+            "live": source.live,
+            "looks": self.looks,
             "notes": source.notes,
             "own": {"fps": source.fps, "um_per_px": source.um_per_px},
             "settings": {name: self.values.get(name) for name in SETTINGS} | {"overlay": self.job.overlay},
@@ -176,8 +180,8 @@ class Desk:
 
     def map(self, size: int) -> TextureMap:
         """How well patches of ``size`` px can be tracked, everywhere in the frame."""
-        if self._map is None or self._map[0] != self.first or self._map[1].size != (size, size):
-            self._map = self.first, texture_map(self.frame, size)
+        if self._map is None or self._map[0] is not self.frame or self._map[1].size != (size, size):
+            self._map = self.frame, texture_map(self.frame, size)
         return self._map[1]
 
     def predict(self, mark: Mark) -> Outlook:
@@ -194,6 +198,13 @@ class Desk:
         self._look(job, self.source if job.fps == self.job.fps else _opened(job))
         self._place(values, self.marks)
 
+    def look(self) -> None:
+        """Another picture of a live camera."""
+        if self.running or not self.source.live:
+            raise ValueError("look: only a camera that is not being tracked has another picture")
+        self._look(self.job, _opened(self.job))
+        self._place(self.values, self.marks)
+
     def track(self, *, resume: bool = False) -> None:
         """Begin the run that the settings tell, or go on with the one that was stopped."""
         if self.running:
@@ -209,6 +220,8 @@ class Desk:
 
     def picture(self, number: int) -> bytes:
         """A frame as JPEG. ValueError in words if it is damaged or there is none."""
+        if self.source.live and number != self.first:
+            raise ValueError("pictures of a camera are not kept; overlay.mp4 has them")
         try:
             frame = Frame(number, self.frame) if number == self.first else self.source[number]
         except IndexError as error:

@@ -38,7 +38,7 @@ class Link:
         self._sending = asyncio.Lock()
         self._actions: dict[str, Callable[..., Any]] = {
             name: getattr(desk, name)
-            for name in ("mark", "outline", "grid", "best", "predict", "set", "track", "stop", "row")
+            for name in ("mark", "outline", "grid", "best", "predict", "set", "track", "stop", "row", "look")
         }
 
     async def serve(self) -> None:

@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import Any
 
 from torch_ecc.commands.jobs import TrackJob
+from torch_ecc.commands.live import Latency
 from torch_ecc.commands.track import Session
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.io.frames import Frame
@@ -35,6 +36,7 @@ class Run:
         self.history = History(start) if left is None else History.of(job.folder())
         self.folder, self.total = self._session.folder, self._session.source.length
         self.state, self.words = State.RUNNING, self._session.remarks()
+        self.latency = Latency()
         self.frame: Frame | None = None  # the last one that can be shown
         self._stopping, self._begun, self._before = threading.Event(), time.perf_counter(), len(self.history)
         self._seconds: float | None = None
@@ -60,11 +62,12 @@ class Run:
             "total": self.total,
             "rate": self.rate,
             "words": self.words,
+            "latency": self.latency.words() if self.state is State.RUNNING else [],
         }
 
     def _track(self) -> None:
         try:
-            finished = self._session.run(watch=self._watch)
+            finished = self._session.run(self._go_on, self._watch)
         except Exception as error:  # whatever it is, people must read it
             state, words = State.FAILED, [str(error) or type(error).__name__]
         else:
@@ -74,8 +77,11 @@ class Run:
         self.state = state
 
     def _watch(self, frame: Frame, estimate: Estimate) -> None:
+        self.latency.add(frame)
         self.history.add(frame, estimate)
         if frame.pixels is not None:
             self.frame = frame
+
+    def _go_on(self, done: int) -> None:
         if self._stopping.is_set():
             raise KeyboardInterrupt

@@ -35,7 +35,7 @@ link.addEventListener("state", ({ detail }) => {
     $("#what").textContent = state.input;
     return;
   }
-  if (!before || before.first !== state.first) show(state.first);
+  if (!before || before.first !== state.first || before.looks !== state.looks) show(state.first);
   if (running() && before?.run?.state !== "running") following = true;
   if (!running()) following = false;
   render();
@@ -125,6 +125,8 @@ function render() {
   if (stage.selected >= state.marks.length) stage.selected = -1;
   curves.um = state.um_matrix;
   $("#slider").max = (state.length ?? 1) - 1;
+  $("#look").hidden = !state.live || running();
+  for (const name of ["#back", "#slider", "#on"]) $(name).hidden = state.live;
   renderMarks();
   renderScale();
   renderSettings();
@@ -230,7 +232,7 @@ function renderProgress() {
   if (run?.total) Object.assign(bar, { max: run.total, value: run.done });
   else bar.removeAttribute("value");
   $("#progressed").textContent = run ? `${run.done}${run.total ? ` of ${run.total}` : ""} frames, ${brief(run.rate)} per second` : "";
-  const words = run?.words ?? state.notes ?? [];
+  const words = [...(run?.words ?? state.notes ?? []), ...(run?.latency ?? [])];
   $("#words").replaceChildren(...words.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
   $("#words").className = run?.state === "failed" ? "bad" : "";
   $("#files").hidden = running() || state.files.length === 0;
@@ -327,7 +329,7 @@ async function describe(found) {
 
 async function renderMap() {
   const size = Number($("#many").size.value);
-  const key = `${size}/${state.first}`;
+  const key = `${size}/${state.looks}`;
   if (mapped === key) return;
   mapped = key;
   const found = await ask("map", { size });
@@ -457,6 +459,7 @@ $("#slider").oninput = ({ target }) => seek(Number(target.value));
 $("#back").onclick = () => seek(cursor - 1);
 $("#on").onclick = () => seek(cursor + 1);
 $("#follow").onclick = () => ((following = true), renderShown());
+$("#look").onclick = () => ask("look");
 $("#here").onclick = () => ask("set", { settings: { frames: `${cursor}:` } });
 $("#clear").onclick = () => ask("mark", { marks: [] });
 curves.addEventListener("seek", ({ detail }) => seek(detail));

@@ -1,0 +1,1 @@
+"""Live cameras, each behind one method: see ``newest.Camera``."""

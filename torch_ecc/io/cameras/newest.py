@@ -1,0 +1,85 @@
+"""What a live camera is, and the policy of all of them: the newest picture counts, and what was missed is counted."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from torch_ecc.io.frames import Pixels
+
+
+class Shot(NamedTuple):
+    """A picture: ``pixels`` (H, W) or (H, W, 3) in RGB order, its ``number`` by the camera's count, the time at which
+    it arrived by ``time.perf_counter``, and how many were ``lost`` since the one that was grabbed before."""
+
+    pixels: Pixels
+    number: int
+    time_s: float
+    lost: int
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """Whatever can give pictures as they come."""
+
+    def grab(self) -> Shot | None:
+        """The newest picture that was not given yet, waited for; None once there will be none any more."""
+        ...
+
+
+class Newest:
+    """A camera of whatever can be read picture by picture. ``read`` waits for the next one and gives it with the
+    camera's own number, if it has one; None at the end. It is called on a thread of its own, from the first grab on.
+
+    ``close`` is called when there is no more, or after ``Newest.close``.
+    """
+
+    def __init__(
+        self, read: Callable[[], tuple[Pixels, int | None] | None], close: Callable[[], None] = lambda: None
+    ) -> None:
+        self._read, self._close = read, close
+        self._news = threading.Condition()
+        self._shot: Shot | None = None
+        self._given = self._count = -1
+        self._ended = False
+        self._error: Exception | None = None
+        self._thread: threading.Thread | None = None
+
+    def grab(self) -> Shot | None:
+        """The newest picture that was not given yet. Raises what reading has raised."""
+        with self._news:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._go_on, name="camera", daemon=True)
+                self._thread.start()
+            self._news.wait_for(lambda: self._shot is not None or self._ended)
+            shot, self._shot = self._shot, None
+            if shot is None:
+                if self._error is not None:
+                    raise self._error
+                return None
+            lost, self._given = (0 if self._given < 0 else shot.number - self._given - 1), shot.number
+            return shot._replace(lost=max(lost, 0))
+
+    def close(self) -> None:
+        """End it."""
+        self._ended = True
+        if self._thread is not None:
+            self._thread.join(timeout=5)
+
+    def _go_on(self) -> None:
+        try:
+            while not self._ended and (read := self._read()) is not None:
+                arrived, (pixels, number) = time.perf_counter(), read
+                self._count = self._count + 1 if number is None else number
+                with self._news:
+                    self._shot = Shot(pixels, self._count, arrived, 0)
+                    self._news.notify()
+        except Exception as error:  # told to whoever grabs
+            self._error = error
+        finally:
+            with self._news:
+                self._ended = True
+                self._news.notify_all()
+            self._close()
