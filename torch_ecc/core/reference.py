@@ -25,7 +25,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_ecc.core.ambient import lasting
+from torch_ecc.core.ambient import lasting, ordinary
 from torch_ecc.core.criteria import Criterion, centred, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.noise import INSTRUMENT_BLUR, template_noise, wiener_weight
@@ -203,7 +203,7 @@ def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared
     return make(*values)
 
 
-@lasting
+@ordinary
 def prepare(
     template: Tensor,
     *,
@@ -215,8 +215,8 @@ def prepare(
     """Everything constant of B templates: (B, 1, h, w), (C, h, w) or (h, w) -> Reference (eqs. 7, 8).
 
     ``mask``: (h, w) or (B, h, w), True or a weight > 0 where the template counts. ``centre`` (B, 2): the point that
-    poses speak of, px from the middle of the array (default: the middle). Raises ValueError for bad shapes, dtypes,
-    NaN, unknown options and for templates of one single grey level.
+    poses speak of, px from the middle of the array (default: the middle). Templates and masks may require grad. Raises
+    ValueError for bad shapes, dtypes, NaN, unknown options and for templates of one single grey level.
     """
     chosen = make_criterion(criterion, illumination)
     gray = as_gray("prepare", "template", template)
@@ -228,7 +228,7 @@ def prepare(
     centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre)
     if centre.shape != (len(gray), 2):
         raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
-    centre = centre.to(gray, copy=True)  # what is prepared keeps it
+    centre = centre.detach().to(gray, copy=True)  # what is prepared keeps it
     some, used = max(PIXELS_AT_ONCE // gray[0].numel(), 1), (kept > 0).any(0).flatten()
     parts = zip(gray.split(some), kept.expand(len(gray), -1, -1, -1).split(some), centre.split(some), strict=True)
     return _joined((_prepared(chosen, *part, used) for part in parts), len(gray))
@@ -262,7 +262,7 @@ def _prepared(criterion: Criterion, gray: Tensor, kept: Tensor, centre: Tensor, 
     def counted(images: Tensor) -> Tensor:  # (B, k, h, w) to (B, k, N)
         return images[:, :, MARGIN:-MARGIN, MARGIN:-MARGIN].flatten(2)[:, :, used]
 
-    grid, wide, noise = _grid(used, gray), pad(gray, MARGIN), template_noise(gray, kept)
+    grid, wide, noise = _grid(used, gray), pad(gray, MARGIN), template_noise(gray.detach(), kept.detach())
     soft = blur(wide, INSTRUMENT_BLUR)
     slopes = gradients(soft)
     wiener = counted(wiener_weight(slopes, noise))
@@ -326,8 +326,9 @@ def _columns(local: Tensor, images: tuple[Tensor, Tensor], wiener: Tensor, weigh
     for image in images:
         level = image[:, 2:].mean(-1, keepdim=True)
         parts = image[:, :2], image[:, 2:] - level
-        unit = [part.abs().amax((1, 2), keepdim=True).clamp(min=1e-30) / LEVELS for part in parts]
-        slopes, t = (unit * (part / unit).round() for part, unit in zip(parts, unit, strict=True))
+        unit = [part.detach().abs().amax((1, 2), keepdim=True).clamp(min=1e-30) / LEVELS for part in parts]
+        # Exactly unit * round(part / unit), with the gradient of the part.
+        slopes, t = (p + (u * (p / u).round() - p).detach() for p, u in zip(parts, unit, strict=True))
         columns.append(_steepest_descent(torch.cat((slopes, t + level), 1), local))
         units += unit
         levels.append(level)

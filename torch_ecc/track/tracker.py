@@ -224,11 +224,12 @@ class Tracker(nn.Module):
         return self._prepared(*(state[name].to(self._buffers[name]) for name in Crop._fields))
 
     @plain
-    @torch.no_grad()
     def forward(self, frame: Tensor) -> Estimate:
         """Poses of all R templates in the next ``frame``, of the same size as the first: Estimate (R, ...).
 
-        The frame is moved to the tracker's device. Raises ValueError for another shape, a wrong dtype, NaN.
+        The frame is moved to the tracker's device. Of one that requires grad poses carry gradients (``core.implicit``),
+        but for those that a search has found; the tracker's state does not. Raises ValueError for another shape, a
+        wrong dtype, NaN.
         """
         with threads_for(self.template.numel()):
             return self._forward(frame)
@@ -239,8 +240,8 @@ class Tracker(nn.Module):
         if image.shape != self.frame_shape:
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
-        images = [image]
-        estimate = self._solve(images, start)
+        images = [image.detach()]
+        estimate = self._solve(image, images, start)
         suspects = suspect(estimate, state["score"])
         if not any(suspects):
             return self._advance(estimate)
@@ -289,12 +290,13 @@ class Tracker(nn.Module):
             raise ValueError("track_sequence: frames must hold at least one frame, got none")
         return Track.stack(estimates)
 
-    def _solve(self, images: list[Tensor], pose: Tensor) -> Estimate:
-        """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are. What a level has found
-        is kept only if it looks better to the next finer one than its start: fine texture is not there in a coarse
-        level, which then leads anywhere."""
+    def _solve(self, image: Tensor, images: list[Tensor], pose: Tensor) -> Estimate:
+        """Coarse to fine; ``images`` holds the ``image`` without gradients and grows to as many levels as there are.
+        What a level has found is kept only if it looks better to the next finer one than its start: fine texture is not
+        there in a coarse level, which then leads anywhere."""
         if self.levels > 1:
-            images[:] = image_pyramid(filled(images[0].float(), self.frame_mask), self.levels)
+            image = filled(image.float(), self.frame_mask)
+            images[:] = image_pyramid(image.detach(), self.levels)
         most = self.settings.max_iterations
         for level in range(self.levels - 1, 0, -1):
             scale, double = (pose.new_tensor((s, s, 1.0)) for s in (2.0**level, 2.0))
@@ -305,18 +307,18 @@ class Tracker(nn.Module):
             better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
         start, usual = self._buffers["start"], self._buffers["score"]
-        return solve(self.references[0], images[0], pose, self.settings, start, usual)
+        return solve(self.references[0], image, pose, self.settings, start, usual)
 
     def _advance(self, estimate: Estimate) -> Estimate:
         """One frame on, in which nothing is suspect: the next state, and the ``estimate``."""
         state: Any = self._buffers
-        last, tracked = state["pose"], state["tracked"]
-        step = (estimate.pose - last).mul_(tracked.unsqueeze(1))
-        state["score"].lerp_(estimate.score, MEMORY)
+        last, tracked, pose = state["pose"], state["tracked"], estimate.pose.detach()
+        step = (pose - last).mul_(tracked.unsqueeze(1))
+        state["score"].lerp_(estimate.score.detach(), MEMORY)
         tracked.fill_(1)
         state["suspect_frames"].zero_()
         state["velocity"].copy_(step)
-        last.copy_(estimate.pose)
+        last.copy_(pose)
         return estimate
 
     def _advance_doubtful(self, estimate: Estimate, suspects: list[bool]) -> Estimate:
@@ -326,12 +328,12 @@ class Tracker(nn.Module):
         last, usual, tracked = state["pose"], state["score"], state["tracked"]
         good = Status.good(estimate.status)
         pose = torch.where(good[:, None], estimate.pose, last)
-        usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
+        usual.lerp_(torch.where(good, estimate.score.detach(), usual), MEMORY)
         stepped = good & (estimate.origin == Origin.TRACKED) & (tracked > 0)
-        state["velocity"].copy_(torch.where(stepped[:, None], pose - last, 0.0))
+        state["velocity"].copy_(torch.where(stepped[:, None], pose.detach() - last, 0.0))
         tracked.copy_(good)
         state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
-        last.copy_(pose)
+        last.copy_(pose.detach())
         return estimate._replace(pose=pose, displacement=pose - state["start"])
 
 
