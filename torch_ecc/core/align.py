@@ -7,17 +7,17 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torch_ecc.core import native, robust, sight, solver
+from torch_ecc.core import implicit, native, robust, sight, solver
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
+from torch_ecc.core.solution import Solution
 from torch_ecc.core.verdict import judge
 
 
 @plain
-@torch.no_grad()
 def align(
     reference: Reference,
     image: Tensor,
@@ -28,7 +28,8 @@ def align(
 
     One image serves all templates without copies. ``displacement`` counts from the start pose, which failed elements
     keep. ``options``: ``interpolation``, ``max_iterations``, ``tolerance``, ``min_score`` ... as in settings.Settings.
-    Raises ValueError for bad shapes, dtypes, devices, NaN and unknown options.
+    Of images, templates or starts that require grad, poses, scores, covariances and residuals carry gradients
+    (``core.implicit``). Raises ValueError for bad shapes, dtypes, devices, NaN and unknown options.
     """
     if not isinstance(reference, Reference):
         raise ValueError(f"align: reference must come from prepare, got {type(reference).__name__}")
@@ -58,6 +59,17 @@ def solve(
 ) -> Estimate:
     """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype; ``origin``:
     what displacements count from, by default the ``pose``; ``usual`` (B,): the templates' scores so far."""
+    if not implicit.wanted(reference, image, pose):
+        return judge(reference, found(reference, image, pose, settings, usual), pose, settings, origin)
+    with torch.no_grad():
+        there = found(reference, image.detach(), pose.detach(), settings, usual)
+    return judge(reference, implicit.attached(reference, image, pose, there, settings), pose, settings, origin)
+
+
+def found(
+    reference: Reference, image: Tensor, pose: Tensor, settings: Settings, usual: Tensor | None = None
+) -> Solution:
+    """What the engine for these B templates finds."""
     engine = native.solve if native.takes(reference, image, settings) else solver.solve
     seeing = engine if reference.sight is None else partial(sight.solve, engine)
-    return judge(reference, robust.solve(seeing, reference, image, pose, settings, usual), pose, settings, origin)
+    return robust.solve(seeing, reference, image, pose, settings, usual)

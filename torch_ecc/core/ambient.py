@@ -50,11 +50,23 @@ def plain(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     return protected
 
 
-def lasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """``plain``, for what is kept: without gradients, and ordinary tensors in inference mode too.
+def ordinary(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """``plain``, for what is kept: ordinary tensors in inference mode too.
 
     A tensor made in inference mode cannot be written to outside of it, ever after.
     """
+
+    @wraps(function)
+    def kept(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        recording = torch.is_grad_enabled()  # which leaving inference mode would turn on
+        with torch.inference_mode(False), torch.set_grad_enabled(recording):
+            return function(*args, **kwargs)
+
+    return plain(kept)
+
+
+def lasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """``ordinary``, without gradients."""
     return plain(torch.inference_mode(False)(torch.no_grad()(function)))
 
 

@@ -164,12 +164,22 @@ def safe_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
     Rows and columns are brought to unit diagonal first: the columns' units differ by orders of magnitude.
     """
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    diagonal = matrix.detach().diagonal(dim1=-2, dim2=-1)
     scale = diagonal.abs().clamp(min=1e-30).rsqrt()
     scale = scale[:, :, None] * scale[:, None, :]
-    inverse = torch.linalg.inv_ex(matrix * scale)[0]
+    scaled = matrix * scale
+    inverse = torch.linalg.inv_ex(scaled)[0]
     regular = (inverse.abs().sum((-2, -1)) < 1e6) & (diagonal > 0).all(-1)  # NaN and infinity compare as singular
+    if matrix.requires_grad:
+        inverse = inverse_where(regular, scaled)
     return torch.where(regular[:, None, None], inverse * scale, 0.0), regular
+
+
+def inverse_where(regular: Tensor, matrix: Tensor) -> Tensor:
+    """Inverse (B, n, n) where ``matrix`` is ``regular`` (B,); elsewhere of no meaning, but with a finite gradient."""
+    one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    inverse: Tensor = torch.linalg.inv_ex(torch.where(regular[:, None, None], matrix, one))[0]
+    return inverse
 
 
 CRITERIA: dict[str, Callable[[str], Criterion]] = {  # by name, of an illumination

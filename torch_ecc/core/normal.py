@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.core.criteria import safe_inverse
+from torch_ecc.core.criteria import inverse_where, safe_inverse
 from torch_ecc.core.noise import errors_in_variables, largest_eigenvalue, noise_response
 
 LEAST = 1e-30  # what is divided by is at least so much
@@ -57,7 +57,7 @@ def normal_equations(sums: Moments) -> Normal:
     inverse, regular = safe_inverse(sums.normal)
     rows, block = inverse[:, :3], inverse[:, :3, :3]
     spread = rows @ sums.power @ rows.mT
-    bread = torch.where(regular[:, None, None], torch.linalg.inv_ex(block)[0], 0.0)
+    bread = torch.where(regular[:, None, None], inverse_where(regular, block), 0.0)
     bread_bias, meat_bias = (
         errors_in_variables(q) * response for q, response in zip(sums.noise.unbind(1), noise_response(), strict=True)
     )

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from torch_ecc.core.ambient import lasting
+from torch_ecc.core.ambient import lasting, ordinary
 from torch_ecc.core.blocks import Blocks, Parts, blocks_of, parts_of
 from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
@@ -183,7 +183,7 @@ def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared
     return make(*values)
 
 
-@lasting
+@ordinary
 def prepare(
     template: Tensor,
     *,
@@ -197,8 +197,8 @@ def prepare(
 
     ``mask``: (h, w) or (B, h, w), True or a weight > 0 where the template counts. ``centre`` (B, 2): the point that
     poses speak of, px from the middle of the array (default: the middle). ``noise`` (B,): the templates' own, grey
-    levels (default: estimated, where fine texture counts as noise). Raises ValueError for bad shapes, dtypes, NaN,
-    unknown options and for templates of one single grey level.
+    levels (default: estimated, where fine texture counts as noise). Templates and masks may require grad. Raises
+    ValueError for bad shapes, dtypes, NaN, unknown options and for templates of one single grey level.
     """
     chosen = make_criterion(criterion, illumination)
     gray = as_gray("prepare", "template", template)
@@ -210,8 +210,8 @@ def prepare(
     centre = gray.new_zeros(len(gray), 2) if centre is None else require_tensor("prepare", "centre", centre)
     if centre.shape != (len(gray), 2):
         raise ValueError(f"prepare: centre must be ({len(gray)}, 2), got {tuple(centre.shape)}")
-    centre = centre.to(gray, copy=True)  # what is prepared keeps it
-    noise = template_noise(gray, kept, noise)
+    centre = centre.detach().to(gray, copy=True)  # what is prepared keeps it
+    noise = template_noise(gray.detach(), kept.detach(), noise)
     some, used = max(PIXELS_AT_ONCE // gray[0].numel(), 1), (kept > 0).any(0).flatten()
     given = (value.split(some) for value in (gray, kept.expand(len(gray), -1, -1, -1), centre, noise))
     return _joined((_prepared(chosen, part, used) for part in zip(*given, strict=True)), len(gray))
@@ -295,8 +295,9 @@ def _columns(local: Tensor, images: tuple[Tensor, Tensor], wiener: Tensor, weigh
     for image in images:
         level = image[:, 2:].mean(-1, keepdim=True)
         parts = image[:, :2], image[:, 2:] - level
-        unit = [part.abs().amax((1, 2), keepdim=True).clamp(min=1e-30) / LEVELS for part in parts]
-        slopes, t = (unit * (part / unit).round() for part, unit in zip(parts, unit, strict=True))
+        unit = [part.detach().abs().amax((1, 2), keepdim=True).clamp(min=1e-30) / LEVELS for part in parts]
+        # Exactly unit * round(part / unit), with the gradient of the part.
+        slopes, t = (p + (u * (p / u).round() - p).detach() for p, u in zip(parts, unit, strict=True))
         columns.append(_steepest_descent(torch.cat((slopes, t + level), 1), local))
         units += unit
         levels.append(level)

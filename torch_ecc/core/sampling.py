@@ -33,7 +33,7 @@ def _linear(f: Tensor) -> Pairs:
 def _cubic(f: Tensor) -> Pairs:
     r, square = 1 - f, f * f
     left, right = (r * r).mul_(r).mul_(1 / 6), (square * f).mul_(1 / 6)
-    high = square.add_(f).mul_(0.5).sub_(right, alpha=2).add_(1 / 6)
+    high = (square + f).mul_(0.5).sub_(right, alpha=2).add_(1 / 6)
     low = 1 - high
     return [(-1, low, low - left), (1, high, right)]
 
@@ -103,25 +103,43 @@ class Sampler(NamedTuple):
 
     def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
         """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside, its border repeats."""
-        turn, shift = warp[:, :, :2], warp[:, :, 2:] - self.origin[:, :, None]
-        scale = _to_unit(*self.values.shape[-2:], self.values.device)
-        if self.kernel.ring == 0:
-            return _lookup(self.values, _points(torch.cat((turn * scale, shift * scale - 1), 2), pixels))
-        return self._spline(_points(torch.cat((turn, shift), 2), pixels), scale.to(pixels.dtype))
+        return self._at(self._points(warp, pixels))
 
-    def _spline(self, points: Tensor, scale: Tensor) -> Tensor:
-        """Values (B, N) at ``points`` (B, 2, N).
+    def slopes(self, warp: Tensor, pixels: Tensor) -> Tensor:
+        """d/dx and d/dy of these values, per px of the frame: (B, 2, N). Where they have a kink, as bilinear ones have
+        on the pixels, those to the right and down."""
+        with torch.enable_grad():
+            points = self._points(warp, pixels).detach().requires_grad_()
+            values = self._replace(values=self.values.detach())._at(points)
+        (slopes,) = torch.autograd.grad(values.sum(), points)
+        return slopes if self.kernel.ring else slopes * self._scale().to(slopes.dtype)
+
+    def _scale(self) -> Tensor:
+        return _to_unit(*self.values.shape[-2:], self.values.device)
+
+    def _points(self, warp: Tensor, pixels: Tensor) -> Tensor:
+        """Where (B, 2, N) the ``warp`` takes ``pixels``: px from value (0, 0); without prefilter, where no more is done
+        with them, in grid_sample's coordinates at once."""
+        turn, shift = warp[:, :, :2], warp[:, :, 2:] - self.origin[:, :, None]
+        if self.kernel.ring == 0:
+            scale = self._scale()
+            turn, shift = turn * scale, shift * scale - 1
+        warp = torch.cat((turn, shift), 2).to(pixels.dtype)
+        return torch.mm(warp.view(-1, 3), pixels).view(len(warp), 2, -1)
+
+    def _at(self, points: Tensor) -> Tensor:
+        """Values (B, N) at ``_points`` (B, 2, N).
 
         Taps are non-negative, so each pair of neighbouring ones is one bilinear lookup at their centre of mass
         (Ruijters et al., 2008): a quarter as many lookups as there are taps.
         """
-        floor = points.floor()
-        pairs = self.kernel.pairs(points.sub_(floor))
+        if self.kernel.ring == 0:
+            return _lookup(self.values, points)
+        floor, scale = points.floor(), self._scale().to(points.dtype)
+        pairs = self.kernel.pairs(points - floor)
         n = len(pairs)
-        at = points.new_empty(len(points), 2 * n, points.shape[-1])  # x of each pair of columns, then y of each of rows
-        for k, (first, total, second) in enumerate(pairs):
-            torch.mul(torch.addcdiv(floor, second, total).add_(first), scale, out=at[:, k::n])
-        at.sub_(1)
+        middles = [torch.addcdiv(floor, second, total).add_(first).mul_(scale) for first, total, second in pairs]
+        at = torch.stack(middles, 2).sub_(1).flatten(1, 2)  # x of each pair of columns, then y of each pair of rows
         wx, wy = zip(*(total.unbind(1) for _, total, _ in pairs), strict=True)
         rows = [[_lookup(self.values, at[:, i : n + j + 1 : n + j - i]) for i in range(n)] for j in range(n)]
         return _sum([_sum(row, wx) for row in rows], wy)
@@ -199,11 +217,6 @@ def _to_unit(h: int, w: int, device: torch.device) -> Tensor:
     return torch.tensor(ends, dtype=pose_dtype(device), device=device)
 
 
-def _points(warp: Tensor, pixels: Tensor) -> Tensor:
-    """Where the ``warp`` (B, 2, 3) takes ``pixels`` (3, N): (B, 2, N), in the pixels' dtype."""
-    return torch.mm(warp.to(pixels.dtype).view(-1, 3), pixels).view(len(warp), 2, -1)
-
-
 def _lookup(image: Tensor, points: Tensor) -> Tensor:
     """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, 2, N): (B, N). Its border repeats."""
     image = image if len(image) == len(points) else image.expand(len(points), -1, -1, -1)
@@ -235,16 +248,17 @@ def prefilter(image: Tensor, interpolation: str, ring: int = 0) -> Tensor:
 
     Two products with a dense inverse: exact, and faster than a recursion, blocks or a 25-tap convolution in torch.
     """
-    rows, columns = (_prefilter_matrix(n, SAMPLERS[interpolation].taps, ring, image.device) for n in image.shape[-2:])
+    taps, like = SAMPLERS[interpolation].taps, (image.dtype, image.device)
+    rows, columns = (_prefilter_matrix(n, taps, ring, *like) for n in image.shape[-2:])
     return rows @ image @ columns.mT
 
 
 @lru_cache(maxsize=64)
 @lasting
-def _prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, device: torch.device) -> Tensor:
+def _prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     inverse = torch.linalg.inv(_band(n, taps, 1, torch.device("cpu")))
     extended: Tensor = inverse[_mirror(torch.arange(-ring, n + ring, device="cpu"), n)]
-    return extended.to(device, torch.float32)
+    return extended.to(device, dtype)
 
 
 @lru_cache(maxsize=64)
@@ -285,7 +299,7 @@ def _quarter(n: int, interpolation: str) -> Tensor:
     for first, total, second in kernel.pairs(torch.tensor(0.25, dtype=torch.float32, device=cpu)):
         taps[index, _mirror(index + first, n)] += total - second
         taps[index, _mirror(index + first + 1, n)] += second
-    return taps @ _prefilter_matrix(n, kernel.taps, 0, cpu) if kernel.ring else taps
+    return taps @ _prefilter_matrix(n, kernel.taps, 0, torch.float32, cpu) if kernel.ring else taps
 
 
 def pad(image: Tensor, margin: int) -> Tensor:

@@ -49,7 +49,7 @@ def solve(
 ) -> Solution:
     """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on, or of those that a ``trust`` is about; on a
     CPU in chunks that fit its cache."""
-    image, blocks = image.float(), None
+    image, blocks = image.to(reference.K.dtype), None
     if trust is not None:
         blocks, reference, start = trust.blocks, reference.select(trust.which), start[trust.which]
         image = image if len(image) == 1 else image[trust.which]

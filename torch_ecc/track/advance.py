@@ -33,14 +33,14 @@ def beginning(start: Tensor) -> dict[str, Tensor]:
 
 def advanced(state: State, estimate: Estimate) -> Estimate:
     """One frame on, in which nothing is suspect: the ``estimate``."""
-    last, since = state["pose"], state["since"]
-    step = (estimate.pose - last).div_(since.unsqueeze(1))
-    state["score"].lerp_(estimate.score, MEMORY)
+    last, since, pose = state["pose"], state["since"], estimate.pose.detach()
+    step = (pose - last).div_(since.unsqueeze(1))
+    state["score"].lerp_(estimate.score.detach(), MEMORY)
     since.fill_(1)
     state["found"].zero_()
     state["suspect_frames"].zero_()
     state["velocity"].copy_(step)
-    last.copy_(estimate.pose)
+    last.copy_(pose)
     return estimate
 
 
@@ -50,15 +50,15 @@ def advanced_in_doubt(state: State, estimate: Estimate, suspects: list[bool]) ->
     last, usual, velocity = state["pose"], state["score"], state["velocity"]
     good = Status.good(estimate.status)
     pose = torch.where(good[:, None], estimate.pose, last)
-    usual.lerp_(torch.where(good, estimate.score, usual), MEMORY)
-    step = (pose - last) / state["since"].unsqueeze(1)
+    usual.lerp_(torch.where(good, estimate.score.detach(), usual), MEMORY)
+    step = (pose.detach() - last) / state["since"].unsqueeze(1)
     found = good & (estimate.origin != Origin.TRACKED)
     leapt = found & ((state["found"] == 0) | (state["since"] > 1))
     velocity.copy_(torch.where(good[:, None], step.masked_fill_(leapt[:, None], 0.0), velocity))
     state["found"].copy_(torch.where(good, found, state["found"]))
     coast(state, good)
     state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
-    last.copy_(pose)
+    last.copy_(pose.detach())
     return estimate._replace(pose=pose, displacement=pose - state["start"])
 
 

@@ -197,9 +197,10 @@ class Tracker(nn.Module):
     def _learned(self, image: Tensor, estimate: Estimate, suspects: list[bool]) -> Estimate:
         """The ``estimate`` of an ``image``, from which the templates have learned."""
         if self.learns:
-            new = self._teacher(image, estimate, suspects, self._buffers)
-            if len(new) > 0:
-                self._use(renewed(self.references, new, self._buffers, self._prepared))
+            with torch.no_grad():
+                new = self._teacher(image, estimate, suspects, self._buffers)
+                if len(new) > 0:
+                    self._use(renewed(self.references, new, self._buffers, self._prepared))
         return estimate
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -266,11 +267,12 @@ class Tracker(nn.Module):
         return self._prepared({name: state[name].to(part) for name, part in self._buffers.items()})
 
     @plain
-    @torch.no_grad()
     def forward(self, frame: Tensor) -> Estimate:
         """Poses of all R templates in the next ``frame``, of the same size as the first: Estimate (R, ...).
 
-        The frame is moved to the tracker's device. Raises ValueError for another shape, a wrong dtype, NaN.
+        The frame is moved to the tracker's device. Of one that requires grad poses carry gradients (``core.implicit``),
+        but for those that a search has found; the tracker's state does not. Raises ValueError for another shape, a
+        wrong dtype, NaN.
         """
         with threads_for(self.template.numel()):
             return self._forward(frame)
@@ -283,9 +285,9 @@ class Tracker(nn.Module):
         if self.learns and self.template._version != self._version:  # by another handle of the same state
             self._use(self._prepared(self._buffers))
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
-        images = [image]
+        images = [image.detach()]
         state["credit"].add_(self.income)
-        estimate = self._within_reach(self._solve(images, start))
+        estimate = self._within_reach(self._solve(image, images, start))
         doubtful = any(suspect(estimate, state["score"]))
         if doubtful and self.search:
             past = Past.of(state)
@@ -352,12 +354,13 @@ class Tracker(nn.Module):
             raise ValueError("track_sequence: frames must hold at least one frame, got none")
         return Track.stack(estimates)
 
-    def _solve(self, images: list[Tensor], pose: Tensor) -> Estimate:
-        """Coarse to fine; ``images`` holds one frame and grows to as many levels as there are. What a level has found
-        is kept only if it looks better to the next finer one than its start: fine texture is not there in a coarse
-        level, which then leads anywhere."""
+    def _solve(self, image: Tensor, images: list[Tensor], pose: Tensor) -> Estimate:
+        """Coarse to fine; ``images`` holds the ``image`` without gradients and grows to as many levels as there are.
+        What a level has found is kept only if it looks better to the next finer one than its start: fine texture is not
+        there in a coarse level, which then leads anywhere."""
         if self.levels > 1:
-            images[:] = image_pyramid(filled(images[0].float(), self.frame_mask), self.levels)
+            image = filled(image.float(), self.frame_mask)
+            images[:] = image_pyramid(image.detach(), self.levels)
         most = self.settings.max_iterations
         for level in range(self.levels - 1, 0, -1):
             scale, double = (pose.new_tensor((s, s, 1.0)) for s in (2.0**level, 2.0))
@@ -368,7 +371,7 @@ class Tracker(nn.Module):
             better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
         start, usual = self._buffers["start"], self._buffers["score"]
-        return solve(self.references[0], images[0], pose, self.settings, start, usual)
+        return solve(self.references[0], image, pose, self.settings, start, usual)
 
 
 def _kept(frame: Tensor) -> Tensor:

@@ -1,0 +1,237 @@
+"""Poses carry gradients: those of the whole solve, exactly, whatever engine, criterion and sampler have found them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from engines import BACKENDS, CRITERIA, SAMPLERS, Problem
+from test_readme import BLOCKS
+from torch import Tensor, nn
+
+import torch_ecc as te
+from torch_ecc.core import reference as prepared
+from torch_ecc.core import solver
+from torch_ecc.core.align import found, solve
+from torch_ecc.core.reference import Reference, prepare
+from torch_ecc.core.settings import Settings
+from torch_ecc.core.solution import Trust
+from torch_ecc.core.verdict import judge
+from torch_ecc.sim.scene.scene import PlaneWaves
+
+SCENE, OTHER = (PlaneWaves.random(seed=seed) for seed in (1, 9))
+FRAME, SIZE = (70, 80), (25, 27)
+MIDDLE = torch.tensor([[13.0, 12.0, 0.0]], dtype=torch.float64)
+TRUTH = torch.tensor([[40.3, 35.7, 0.1], [44.2, 38.1, -2.0], [8.0, 33.0, 0.7]], dtype=torch.float64)
+WHOLE = {"tolerance": 1e-11, "max_iterations": 60, "backend": "torch"}  # until nothing moves any more
+
+
+def noisy(image: Tensor, seed: int = 0) -> Tensor:
+    return image + 4 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
+
+
+def seen(truth: Tensor = TRUTH, noise: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    """Templates, an image of each and starts; the last of them crosses the frame's border."""
+    templates = noisy(SCENE.render(MIDDLE.expand(len(truth), 3), SIZE), noise + 1)
+    return templates, noisy(SCENE.render(truth, FRAME), noise), truth + torch.tensor([0.3, -0.2, 0.01])
+
+
+def exact(reference: Reference) -> Reference:
+    """In float64."""
+    return reference.map(lambda value: value.double() if value.is_floating_point() else value)
+
+
+def covered(images: Tensor) -> Tensor:
+    """With another scene over a part of what the first templates see."""
+    images = images.clone()
+    images[:2, :, 20:35, 25:55] = OTHER.render(TRUTH[:1], FRAME)[0, :, 20:35, 25:55].to(images)
+    return images
+
+
+def slope(function, value: Tensor, direction: Tensor, step: float) -> Tensor:
+    """The central difference of a function along a direction."""
+    return (function(value + step * direction) - function(value - step * direction)) / (2 * step)
+
+
+def direction(value: Tensor) -> Tensor:
+    return torch.randn(value.shape, generator=torch.Generator().manual_seed(7), dtype=value.dtype)
+
+
+@pytest.mark.parametrize("interpolation", SAMPLERS)
+@pytest.mark.parametrize("criterion", CRITERIA, ids=str)
+def test_gradcheck_of_the_whole_solve(criterion, interpolation):
+    """In float64, by all pixels of images and by the starts; one template crosses the border."""
+    templates, images, start = seen()
+    reference, settings = exact(prepare(templates, criterion=criterion)), Settings(interpolation, robust=False, **WHOLE)
+
+    def poses(images: Tensor, start: Tensor) -> Tensor:
+        return solve(reference, images, start, settings).pose
+
+    values = images.double().requires_grad_(), start.clone().requires_grad_()
+    assert torch.autograd.gradcheck(poses, values, eps=1e-4, atol=1e-8, rtol=1e-5, fast_mode=True)
+
+
+def test_gradcheck_pixel_by_pixel():
+    """Those of one image that two templates share, which lie in the middle of both."""
+    templates, images, _ = seen()
+    reference, settings = exact(prepare(templates[:2])), Settings(robust=False, **WHOLE)
+    start = torch.tensor([[40.0, 35.0, 0.1], [40.4, 35.9, 0.1]], dtype=torch.float64)
+
+    def poses(patch: Tensor) -> Tensor:
+        view = images[:1].double().index_put((torch.tensor([[0]]), torch.tensor([[0]]), rows[:, None], rows), patch)
+        return solve(reference, view, start, settings).pose
+
+    rows = torch.arange(36, 40)
+    patch = images[0, 0, 36:40, 36:40].double().requires_grad_()
+    assert torch.autograd.gradcheck(poses, patch, eps=1e-4, atol=1e-8, rtol=1e-5)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("field", ["pose", "displacement", "score", "covariance", "residual_rms"])
+def test_every_field_has_the_slope_of_the_whole_solve(field, robust):
+    """In float64; of a robust one, with a part covered, that of the solve with the weights that it has come to."""
+    templates, images, start = seen()
+    reference, images = exact(prepare(templates)), (covered(images) if robust else images).double().requires_grad_()
+    settings = Settings(robust=robust, **WHOLE)
+    value = getattr(solve(reference, images, start, settings), field)
+    weight, along = direction(value), direction(images)
+    (gradient,) = torch.autograd.grad((value * weight).sum(), images)
+    blocks = found(reference, images.detach(), start, settings).trust
+    assert (blocks is not None and bool((blocks[:2] < 0.1).any(1).all())) == robust
+    trust = None if blocks is None else Trust(torch.arange(3), blocks)
+
+    def weighted(image: Tensor) -> Tensor:
+        there = solver.solve(reference, image.detach(), start, settings, trust)._replace(trust=blocks)
+        return (getattr(judge(reference, there, start, settings), field) * weight).sum()
+
+    torch.testing.assert_close((gradient * along).sum(), slope(weighted, images, along, 1e-3), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA, ids=str)
+def test_by_templates_and_their_weights(criterion, monkeypatch):
+    """Through all that is prepared of them, apart from the noise that they are taken to have, and unrounded."""
+    templates, images, start = seen(TRUTH[:2])
+    mask = 0.5 + torch.rand(2, *SIZE, generator=torch.Generator().manual_seed(3))
+    settings, noise = Settings(robust=False, **WHOLE), prepare(templates, mask=mask).noise.level
+    monkeypatch.setattr(prepared, "template_noise", lambda gray, kept: noise)
+    monkeypatch.setattr(prepared, "LEVELS", 2**40)
+    weight = direction(start)
+
+    def moved(templates: Tensor, mask: Tensor) -> Tensor:
+        reference = exact(prepare(templates, criterion=criterion, mask=mask))
+        return (solve(reference, images.double(), start, settings).pose * weight).sum()
+
+    values = templates.clone().requires_grad_(), mask.clone().requires_grad_()
+    by_template, by_mask = torch.autograd.grad(moved(*values), values)
+    along = direction(templates)
+    true = slope(lambda t: moved(t, mask), templates, along, 0.1)
+    torch.testing.assert_close((by_template * along).sum().double(), true, rtol=2e-3, atol=0)
+    along = direction(mask)
+    true = slope(lambda m: moved(templates, m), mask, along, 0.01)
+    torch.testing.assert_close((by_mask * along).sum().double(), true, rtol=2e-3, atol=0)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_engines_have_the_same_gradients(robust):
+    """And the same numbers as without any."""
+    templates, images, start = seen()
+    images, gradients = covered(images), []
+    for backend in (param.values[0] if hasattr(param, "values") else param for param in BACKENDS):
+        image, template = images.clone().requires_grad_(), templates.clone().requires_grad_()
+        estimate = te.align(prepare(template), image, start, backend=backend, robust=robust)
+        plain = te.align(prepare(templates), images, start, backend=backend, robust=robust)
+        for value, same in zip(estimate, plain, strict=True):
+            assert torch.equal(value, same)
+            assert value.requires_grad == same.is_floating_point() or value is estimate.coverage
+        gradients.append(torch.autograd.grad(estimate.pose.sum(), (image, template)))
+    for native, page in zip(*gradients, strict=True):
+        torch.testing.assert_close(native, page, rtol=1e-2, atol=1e-2 * float(page.abs().max()))
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [{"texture": "edge"}, {"shown": "other"}, {"shown": "blank", "dtype": torch.float32}, {"place": "outside"}],
+    ids=str,
+)
+def test_what_was_not_found_takes_the_gradient_to_its_start(problem):
+    """And none to image or template, nor NaN: an edge, another scene, a frame without contrast, out of view."""
+    problem = Problem(count=2, **problem)
+    reference, image, start = problem.made(CRITERIA[1])
+    templates = reference.signal[:, 3].reshape(2, 1, *problem.size).clone().requires_grad_()
+    image, start = image.float().requires_grad_(), start.requires_grad_()
+    estimate = te.align(prepare(templates), image, start)
+    assert not estimate.ok.any()
+    gradients = torch.autograd.grad(estimate.pose.sum(), (image, templates, start), retain_graph=True)
+    assert [bool(gradient.any()) for gradient in gradients] == [False, False, True]
+    assert torch.equal(gradients[2], torch.ones_like(start))
+    others = (estimate.score + estimate.residual_rms).sum() + estimate.covariance.nan_to_num(posinf=0).sum()
+    for gradient in torch.autograd.grad(others, (image, templates)):
+        assert gradient.isfinite().all()
+
+
+def test_a_start_has_no_share_in_what_was_found():
+    templates, images, start = seen()
+    start.requires_grad_()
+    estimate = te.align(prepare(templates), images, start)
+    estimate.pose.sum().backward()
+    assert not start.grad.any()
+    assert not te.align(prepare(templates), images, start.detach()).pose.requires_grad
+    with torch.no_grad():
+        assert not te.align(prepare(templates), images, start).pose.requires_grad
+
+
+def test_under_a_mark_of_the_camera_no_pixel_counts():
+    """But for what the spline's prefilter spreads; the tracker's poses have the slope of the whole solve."""
+    _, images, _ = seen(TRUTH[:1])
+    shown = torch.ones(FRAME, dtype=torch.bool)
+    shown[30:34] = False
+    frame = images[0].clone().requires_grad_()
+    still = noisy(SCENE.render(TRUTH[:1] * 0 + torch.tensor([40.0, 35.0, 0.0]), FRAME), 5)
+
+    def tracked(frame: Tensor) -> Tensor:
+        tracker = te.Tracker(still[0], [(40.0, 35.0)], 31, frame_mask=shown, tolerance=1e-7, max_iterations=40)
+        return tracker(frame).pose
+
+    pose = tracked(frame)
+    (gradient,) = torch.autograd.grad(pose.sum(), frame)
+    assert gradient[:, 31:33].abs().max() < 0.03 * gradient.abs().max()
+    along = direction(frame)
+    true = slope(lambda image: tracked(image.detach()).sum(), frame, along, 0.03)
+    torch.testing.assert_close((gradient * along).sum().double(), true, rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize("options", [{}, {"levels": 2}, {"prediction": "hold"}, {"robust": False}], ids=str)
+def test_a_tracker_gives_gradients_and_keeps_none(options):
+    """Frame by frame, a lost one and one that is found by a search between them."""
+    path = torch.tensor(
+        [[40.0, 35, 0], [40.6, 35.2, 0.02], [300, 300, 0], [50.1, 40.6, 0.1], [50.4, 40.3, 0.1]]
+    ).double()
+    frames = noisy(SCENE.render(path, FRAME))
+    tracker, plain = (te.Tracker(frames[0], [(40.0, 35.0)], 31, **options) for _ in range(2))
+    flows = []
+    for frame in frames[1:].clone().requires_grad_():
+        estimate, same = tracker(frame), plain(frame.detach())
+        assert torch.equal(estimate.pose, same.pose)
+        (gradient,) = torch.autograd.grad(estimate.pose.sum() + 0 * frame.sum(), frame)
+        flows.append(bool(gradient.any()))
+        assert not any(part.requires_grad for part in tracker.buffers())
+        if not bool(estimate.ok):
+            assert not gradient.any()
+    assert flows == [True, False, False, True]
+
+
+def test_a_filter_is_learned_in_front_of_a_tracker():
+    """Frames are smeared to one side, so that poses are half a pixel off; what the README's loop learns undoes it."""
+    path = torch.zeros(12, 3, dtype=torch.float64)
+    path[:, :2] = torch.tensor([40.0, 35.0]) + 1.5 * torch.sin(torch.arange(24).view(12, 2) * 0.4)
+    frames = noisy(SCENE.render(path, FRAME))
+    smear = torch.tensor([0.0, 0.0, 0.6, 0.3, 0.1]).view(1, 1, 1, 5)
+    smeared = nn.functional.conv2d(nn.functional.pad(frames, (2, 2, 0, 0), mode="replicate"), smear)
+    tracker = te.Tracker(frames[0], path[:1, :2], 31)
+    names = {"torch": torch, "tracker": tracker, "frames": smeared.repeat(6, 1, 1, 1), "poses": path.repeat(6, 1)}
+    before = [tracker(frame).pose for frame in smeared]
+    exec(next(block for block in BLOCKS if "Adam" in block), names)
+    with torch.no_grad():
+        after = [names["model"](frame).pose for frame in smeared]
+    error = [(torch.cat(poses) - path).square().sum(1).mean().sqrt() for poses in (before, after)]
+    assert error[0] > 0.4
+    assert error[1] < 0.1
