@@ -76,7 +76,7 @@ def rigid_groups(track: Estimate, bodies: int) -> Groups:
         raise ValueError(f"rigid_groups: bodies must be a whole number of at least 1, got {bodies!r}")
     seen = _sampled(track)
     standing = _still(seen)
-    free, found = seen.good.sum(0) >= FEWEST_FRAMES, []
+    free, found = seen.good.sum(0) >= FEWEST_FRAMES, list[Tensor]()
     still = int(((_misfit(seen, standing)[0] < EXPLAINED) & free).sum()) >= FEWEST
     if still:
         free &= _misfit(seen, standing)[0] >= EXPLAINED

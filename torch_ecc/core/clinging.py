@@ -65,7 +65,7 @@ def clinging(reference: Reference, found: Solution, variance: Tensor, of_both: T
 def in_lines(effect: Tensor, white: Tensor, scatter: Tensor, grid: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Scatter (B, 3, 2) as of rows and of columns of blocks with an ``effect`` (B, 3, blocks), and whether it is for
     certain more than the ``scatter`` (B, 3) of blocks."""
-    member, kind, sure, free = _lines(grid, effect.device)
+    member, kind, sure, free = _lines(grid, effect.dtype, effect.device)
     lines = torch.matmul(torch.matmul(effect, member).square_(), kind).div(white.unsqueeze(2))
     return lines * free, lines > sure * scatter.unsqueeze(2)
 
@@ -90,7 +90,7 @@ def without_strain(parts: Parts, found: Solution) -> tuple[Tensor, Tensor]:
     square = (strain[:, :, None] * strain[:, None] + uncertain) * (certain / found.gain.to(certain).square()[:, None])[
         ..., None
     ]
-    turned = (square.diagonal(dim1=1, dim2=2) * _turning(square.device)).sum(1) / parts.radius.square()
+    turned = (square.diagonal(dim1=1, dim2=2) * _turning(square.dtype, square.device)).sum(1) / parts.radius.square()
     strained = (shift @ square @ shift.mT).to(turned.dtype)
     strained[:, 2, 2] += turned
     return effect, strained.nan_to_num(0.0, 0.0, 0.0)
@@ -124,14 +124,14 @@ def _at(index: Tensor, record: Fields) -> Fields:
 
 @lru_cache(maxsize=16)
 @torch.inference_mode(False)
-def _turning(device: torch.device) -> Tensor:
+def _turning(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Which of ``STRAINS`` turn parts of the target, 0 or 1."""
-    return torch.tensor([float(turns) for _, turns in STRAINS], dtype=torch.float32, device=device)
+    return torch.tensor([float(turns) for _, turns in STRAINS], dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
-def _lines(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, ...]:
+def _lines(grid: tuple[int, int], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
     """Of a grid of blocks: which rows and columns they are in, (blocks, rows + columns); which of these are rows, and
     which columns, (rows + columns, 2); how many times that of blocks their scatter is for certain, (2,); and what makes
     up for so few, (2,).
@@ -139,9 +139,9 @@ def _lines(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, ...]:
     The fit has made the sum of n lines zero, and an error over a scatter of so few has Student's distribution, with the
     variance (n - 1) / (n - 3).
     """
-    rows, columns = (torch.eye(n, dtype=torch.float32, device=device) for n in grid)
+    rows, columns = (torch.eye(n, dtype=dtype, device=device) for n in grid)
     member = torch.cat((rows.repeat_interleave(grid[1], 0), columns.repeat(grid[0], 1)), 1)
-    kind = torch.eye(2, dtype=torch.float32, device=device).repeat_interleave(torch.tensor(grid, device=device), 0)
+    kind = torch.eye(2, dtype=dtype, device=device).repeat_interleave(torch.tensor(grid, device=device), 0)
     sure, free = [1 + SURE * (2 / n) ** 0.5 for n in grid], [n / max(n - 3, 1) for n in grid]
-    numbers = torch.tensor([sure, free], dtype=torch.float32, device=device)
+    numbers = torch.tensor([sure, free], dtype=dtype, device=device)
     return member, kind, numbers[0], numbers[1]
