@@ -112,12 +112,11 @@ def test_by_templates_and_their_weights(criterion, monkeypatch):
     templates, images, start = seen(TRUTH[:2])
     mask = 0.5 + torch.rand(2, *SIZE, generator=torch.Generator().manual_seed(3))
     settings, noise = Settings(robust=False, **WHOLE), prepare(templates, mask=mask).noise.level
-    monkeypatch.setattr(prepared, "template_noise", lambda gray, kept: noise)
     monkeypatch.setattr(prepared, "LEVELS", 2**40)
     weight = direction(start)
 
     def moved(templates: Tensor, mask: Tensor) -> Tensor:
-        reference = exact(prepare(templates, criterion=criterion, mask=mask))
+        reference = exact(prepare(templates, criterion=criterion, mask=mask, noise=noise))
         return (solve(reference, images.double(), start, settings).pose * weight).sum()
 
     values = templates.clone().requires_grad_(), mask.clone().requires_grad_()

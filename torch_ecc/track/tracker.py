@@ -370,8 +370,7 @@ class Tracker(nn.Module):
             finer = self.references[level - 1], images[level - 1]
             better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
             pose = torch.where(better[:, None], state.pose * scale, pose)
-        start, usual = self._buffers["start"], self._buffers["score"]
-        return solve(self.references[0], image, pose, self.settings, start, usual)
+        return solve(self.references[0], image, pose, self.settings, self._buffers["start"], self._buffers["score"])
 
 
 def _kept(frame: Tensor) -> Tensor:
