@@ -24,7 +24,7 @@ from torch_ecc.core.build import TARGETS, Target, constants, digest, key
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
-LARGEST = 2**20  # bytes of a wheel
+LARGEST = 2**21  # bytes of a wheel
 ENTRY = "torch_ecc_solve"
 SYSTEM = {  # what a library may need beside itself
     ".so": {"libm.so.6", "libpthread.so.0", "libc.so.6", "libdl.so.2", "ld-linux-x86-64.so.2"},

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import resource
 import signal
 import sys
 from collections.abc import Callable
@@ -18,6 +17,9 @@ import torch
 
 from torch_ecc import prepare
 from torch_ecc.core import native
+
+if sys.platform != "win32":  # where there is no fork either
+    import resource
 
 SECONDS, BYTES = 10, 2**33  # for each call
 Arguments = dict[str, Any]

@@ -22,6 +22,8 @@ from torch_ecc.core import entry, native, reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Trust
 
+forking = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes do not fork here")
+
 
 @compiled
 def test_threads_do_not_matter(monkeypatch):
@@ -217,6 +219,7 @@ def outcomes() -> dict[str, str]:
 
 
 @compiled
+@forking
 @pytest.mark.parametrize("name", operator_calls.WRONG | operator_calls.ODD)
 def test_no_direct_call_of_the_operator_ends_the_process(name, outcomes):
     """What is wrong is refused with a sentence; what is odd may be answered."""
@@ -264,6 +267,7 @@ def test_a_copied_reference_outlives_its_original():
 
 
 @compiled
+@forking
 def test_a_forked_process_solves_too(monkeypatch):
     """It has none of the threads that have served before."""
     prepared, image, start = Problem(count=16).made(ECC())

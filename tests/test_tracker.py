@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import gc
 import math
-import resource
 import subprocess
 import sys
 from functools import partial
@@ -289,6 +288,7 @@ def test_memory_stays_flat_over_a_long_stream():
     for k in range(200):
         tracker(stack[k % 24])
     gc.collect()
+    resource = pytest.importorskip("resource")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for k in range(800):
         tracker(stack[k % 24])

@@ -1,6 +1,7 @@
 // Threads that sleep until there is work. The caller works too and waits for none that has not begun: where something
 // else keeps a core busy, it does all by itself.
 #pragma once
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <cstdint>
