@@ -165,15 +165,18 @@ def speed(count: int, frames: int, rounds: int) -> None:
         elapsed = {}
         for workers in (1, 2):
             heard: list[float] = []
-            te.batch(
+            done = te.batch(
                 f"{folder}/*.npy",
                 folder / f"out{workers}",
                 workers=workers,
                 progress=lambda done, of, heard=heard: heard.append(time.perf_counter()),
+                overlay=False,
                 **SETTINGS,
             )
             elapsed[workers] = heard[-1] - heard[0]
-            console.print(f"{workers} worker(s): {elapsed[workers]:.1f} s for {count} recordings of {frames} frames")
+            busy = sum(row["wall_s"] for row in done.rows) / workers / elapsed[workers]
+            told = f"{elapsed[workers]:.1f} s for {count} recordings of {frames} frames"
+            console.print(f"{workers} worker(s): {told}, each busy {100 * busy:.0f} % of it")
         ratio, load = elapsed[1] / elapsed[2], os.getloadavg()[0]
         console.print(f"two beside one: {ratio:.2f}; {os.cpu_count()} cores, load {load:.1f}")
 
@@ -201,9 +204,9 @@ def beside(folder: Path, rounds: int) -> None:
         console.print(f"processor time of a recording, {name}: {told} s, {100 * more:+.1f} %")
 
 
-def stub(number: int) -> dict[str, Any]:
+def stub(work: Work) -> dict[str, Any]:
     """A call that does nothing."""
-    return {"folder": str(number), "status": "tracked"}
+    return {"folder": work.name, "status": "tracked"}
 
 
 @app.command()
@@ -224,7 +227,8 @@ def scheduler(count: int) -> None:
                 console.print(f"{seen} calls: {used}")
 
         started = time.perf_counter()
-        Queue((Task(str(k), stub, k) for k in range(count)), came).run(client, lambda: None)
+        works = (Work(str(k), TrackJob(input="none"), Path(), "ours", {}) for k in range(count))
+        Queue((Task(work.name, stub, work) for work in works), came).run(client, lambda: None)
         console.print(f"{1e3 * (time.perf_counter() - started) / count:.1f} ms per call")
 
 

@@ -350,6 +350,7 @@ def test_names_that_clash_are_told_apart(tmp_path):
         (["a.npy"], {"workers": 0}, "workers: expected 1 or more, got 0"),
         (["a.npy"], {"parts": 2, "stabilise": 0}, "stabilise: not with parts"),
         (["a.npy"], {"match": {"a*": {"sizes": 3}}}, "unknown key 'sizes'"),
+        (["a.npy"], {"match": {"a*": {"stabilise": 0}}, "parts": 2}, "stabilise: not with parts"),
     ],
 )
 def test_bad_settings_have_words(recordings, settings, words, tmp_path):
@@ -407,8 +408,14 @@ def test_a_gpu_is_asked_of_the_cluster(one, tmp_path, client):
     assert not (tmp_path / "out").exists()
 
 
-def stub(number: int) -> dict[str, object]:
-    return {"folder": str(number), "status": "tracked"}
+def stub(work: Work) -> dict[str, object]:
+    return {"folder": work.name, "status": "tracked"}
+
+
+def stubs(count: int) -> list[Task]:
+    """Calls that do nothing."""
+    job = TrackJob(input="none")
+    return [Task(str(k), stub, Work(str(k), job, Path(), "mine", {})) for k in range(count)]
 
 
 def test_few_calls_are_out_at_a_time(client):
@@ -419,7 +426,7 @@ def test_few_calls_are_out_at_a_time(client):
         most.append(len(client.futures))
         rows.append(row["folder"])
 
-    Queue((Task(str(k), stub, k) for k in range(60)), came).run(client, lambda: None)
+    Queue(stubs(60), came).run(client, lambda: None)
     assert sorted(rows, key=int) == [str(k) for k in range(60)]
     assert max(most) <= 2 * 2
 
@@ -432,7 +439,7 @@ def test_what_was_out_when_the_scheduler_went_is_handed_out_again(client):
         if len(rows) == 3:
             client.cancel(list(queue._out))
 
-    queue = Queue((Task(str(k), stub, k) for k in range(12)), came)
+    queue = Queue(stubs(12), came)
     with pytest.raises(SchedulerGoneError):
         queue.run(client, lambda: None)
     queue.run(client, lambda: None)

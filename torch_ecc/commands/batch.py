@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from torch_ecc.commands.batch_cluster import check_cluster, connected, cores, dashboard_of, need_dask
 from torch_ecc.commands.batch_list import Recording, Recordings, read_list
 from torch_ecc.commands.batch_parts import cut, do_join, do_part, forget_parts
-from torch_ecc.commands.batch_queue import Queue, SchedulerGoneError, Task
+from torch_ecc.commands.batch_queue import Queue, SchedulerGoneError, Task, on_gpu
 from torch_ecc.commands.batch_report import Failures, check_report, table_of, write_report
 from torch_ecc.commands.batch_unit import (
     FAILED,
@@ -133,7 +133,7 @@ class _Run:
         self.rows: dict[str, Row] = {}
         self.todo = self._left()
         self.tally = _Tally(len(self.todo), progress)
-        self.gpu = any((work.job.device or "").startswith("cuda") for work in self.works)
+        self.gpu = any(map(on_gpu, self.todo))
 
     def run(self, client: Client | None, say: Say) -> Batch:
         """Do what is to be done, and report whatever comes."""
@@ -182,7 +182,7 @@ class _Run:
 
     def _hand_out(self, client: Client | None, say: Say) -> None:
         """All of it, on another scheduler if one is lost and comes back in time."""
-        queue, deadline = Queue(self._tasks(), self._came, gpu=self.gpu), 0.0
+        queue, deadline = Queue(self._tasks(), self._came), 0.0
         while True:
             try:
                 with nullcontext(client) if client is not None else self._cluster() as cluster:
@@ -199,8 +199,8 @@ class _Run:
                 time.sleep(1.0)
 
     def _cluster(self) -> Any:
-        workers = min(self.job.workers or cores(), len(self.todo) * self.job.parts)
-        return connected(self.job.scheduler, workers, gpu=self.gpu)
+        most = self.job.workers or (1 if self.gpu else cores())
+        return connected(self.job.scheduler, min(most, len(self.todo) * self.job.parts), gpu=self.gpu)
 
     def _use(self, cluster: Client, queue: Queue, say: Say) -> None:
         check_cluster(cluster, self.folder, gpu=self.gpu)
@@ -228,5 +228,5 @@ class _Run:
 
     def _report(self, rows: list[Row]) -> None:
         """The table and the pictures, of what there is."""
-        self.failures.write([row for row in rows if row["status"] == FAILED])
+        self.failures.write([row for row in rows if row["status"] == FAILED], self.works)
         write_report(self.folder, rows, self.job, anew=bool(self.todo))

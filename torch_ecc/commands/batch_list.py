@@ -42,12 +42,9 @@ def read_list(recordings: Recordings, values: Mapping[str, Any]) -> tuple[BatchJ
         where, folder = str(given[0]), Path(given[0]).expanduser().parent
         values = _placed(read_toml(given[0]), folder) | values
         given = values.pop("recordings", [])
+    given = [str(each) for each in given] if isinstance(given, list) else given
     batch_values = {name: values.pop(name) for name in _names(BatchJob) if name in values}
-    job = fill(BatchJob, batch_values | {"recordings": [str(each) for each in given]}, where)
-    if job.parts > 1:
-        values["overlay"] = False
-        if values.get("stabilise") is not None:
-            raise ValueError(f"stabilise: not with parts, which write no videos; got {values['stabilise']}")
+    job = fill(BatchJob, batch_values | {"recordings": given}, where)
     arrays = recordings if isinstance(recordings, Mapping) else {}
     paths = list(arrays) or [path for each in job.recordings for path in _expanded(each, folder)]
     if not paths:
@@ -110,6 +107,10 @@ def _jobs(paths: list[str], values: Mapping[str, Any], job: BatchJob, where: str
             own = dict(values)
             for pattern in fitting:
                 own = _replaced(own, job.match[pattern])
+            if job.parts > 1:
+                own["overlay"] = False
+                if own.get("stabilise") is not None:
+                    raise ValueError(f"stabilise: not with parts, which write no videos; got {own['stabilise']}")
             checked[fitting] = _job(path, own, f"{where}, {Path(path).name}")
         jobs[path] = checked[fitting]
     return jobs

@@ -42,12 +42,16 @@ class Task:
     tries: int = 0
 
 
+def on_gpu(work: Work) -> bool:
+    """Does it need a worker with a GPU?"""
+    return (work.job.device or "").startswith("cuda")
+
+
 class Queue:
     """The ``tasks``, made one by one when there is a worker for them; ``came`` is told of every row."""
 
-    def __init__(self, tasks: Iterable[Task], came: Callable[[Row], None], *, gpu: bool = False) -> None:
+    def __init__(self, tasks: Iterable[Task], came: Callable[[Row], None]) -> None:
         self._tasks, self._came = iter(tasks), came
-        self._resources = {GPU: 1} if gpu else None
         self._again: deque[Task] = deque()  # what was lost, or has become possible
         self._out: dict[Future, Task] = {}
         self._most, self._look = 0, 0.0
@@ -83,7 +87,8 @@ class Queue:
                 break
             # A scheduler remembers every group of keys that it has seen: all of ours are of one.
             name = (f"torch_ecc.{task.make.__name__}", task.key, secrets.token_hex(4))
-            future = client.submit(task.make, task.work, *task.rest, key=name, pure=False, resources=self._resources)
+            needs = {GPU: 1} if on_gpu(task.work) else None
+            future = client.submit(task.make, task.work, *task.rest, key=name, pure=False, resources=needs)
             self._out[future] = task
             back.add(future)
         return len(self._out)

@@ -97,7 +97,6 @@ class Failures:
 
     def __init__(self, folder: Path, known: dict[str, Any]) -> None:
         self.folder, self.known = folder, known
-        self.works: dict[str, Work] = {}
 
     @staticmethod
     def read(folder: Path) -> Failures:
@@ -106,7 +105,6 @@ class Failures:
 
     def of(self, work: Work) -> Row | None:
         """The row of a recording that has failed and has not changed since."""
-        self.works[work.name] = work
         told = self.known.get(work.name, {})
         same = (
             told.get("settings") == given_settings(work.job)
@@ -115,14 +113,15 @@ class Failures:
         )
         return told["row"] if same else None
 
-    def write(self, failed: list[Row]) -> None:
-        """For the next run."""
-        settings = {work.name: given_settings(work.job) for work in self.works.values()}
+    def write(self, failed: list[Row], works: list[Work]) -> None:
+        """For the next run: what has failed of these works."""
+        settings = {work.name: given_settings(work.job) for work in works}
         kept: dict[str, object] = {
             row["folder"]: {"settings": settings[row["folder"]], "versions": versions(), "row": row}
             for row in failed
             if row.get("lasting")
         }
+        kept |= {name: told for name, told in self.known.items() if name not in settings}  # of other lists
         if kept or self.known:
             write_json(part(self.folder, FAILURES), kept)
             publish(self.folder, FAILURES)
