@@ -6,6 +6,7 @@ import itertools
 import json
 import socket
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -245,6 +246,30 @@ def test_a_loop_is_closed_on_a_stage_of_micromanager(core):
     x, y = core.getXYPosition()
     assert abs(x) < 0.05
     assert abs(y) < 0.05
+
+
+def test_the_shipped_file_closes_a_loop(core, tmp_path):
+    """By the command line: what was looked at ends where it was to be, and what is wrong is told before a move."""
+    config = Path(__file__).parents[1] / "configs/servo_micromanager.toml"
+    done = CliRunner().invoke(cli.app, ["servo", str(config), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    assert "at the desired pose" in done.output
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["aligned"]
+    assert max(abs(summary["error"][name]) for name in ("x_px", "y_px")) < 0.05
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"log.csv", "overlay.mp4", "summary.json"}
+    text = config.read_text()
+    for change, words in [
+        (("[belief]", "[belive]"), "unknown key 'belive'"),
+        (('"demo"', '"nowhere.cfg"'), "Micro-Manager cannot load 'nowhere.cfg'"),
+        (("266.0, 250.0", "266.0, 20.0"), "outside the view"),
+        (("[[-100.0, 100.0]", "[[-9000.0, -8000.0]"), "desired pose is unreachable"),
+    ]:
+        (tmp_path / "wrong.toml").write_text(text.replace(*change))
+        x, y = core.getXYPosition()
+        wrong = CliRunner().invoke(cli.app, ["servo", str(tmp_path / "wrong.toml"), "--out", str(tmp_path / "wrong")])
+        assert words in str(wrong.exception)
+        assert core.getXYPosition() == pytest.approx([x, y], abs=1e-6)
 
 
 def test_a_stage_is_asked_for_what_it_has(core):

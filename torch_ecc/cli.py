@@ -249,12 +249,16 @@ def compare(**options: Any) -> None:
 def servo(config: str, **options: Any) -> None:
     """Align a probe with a substrate by visual servoing on the simulated workstation (section V).
 
-    CONFIG is a TOML file such as configs/servo.toml. Exit status 0 only if the probe is where it should be.
+    CONFIG is a TOML file such as configs/servo.toml, or, for a stage and a camera that Micro-Manager drives,
+    configs/servo_micromanager.toml. Exit status 0 only if the probe, or the patch, is where it should be.
     """
     from torch_ecc.commands.servo import describe, run_session
     from torch_ecc.commands.servo_job import ServoJob
 
     values = read_toml(config)
+    if "micromanager" in values:
+        _servo_stage(values | {"align": values.get("align", {}) | given(options)})
+        return
     job = ServoJob.read(
         values | {"align": values.get("align", {}) | given(options)}, folder=Path(config).expanduser().parent
     )
@@ -264,6 +268,19 @@ def servo(config: str, **options: Any) -> None:
         console.print(line, soft_wrap=True)
     if not run.alignment.aligned:
         sys.exit(INTERRUPTED if run.alignment.ending.name == "INTERRUPTED" else 1)
+
+
+def _servo_stage(values: dict[str, Any]) -> None:
+    """Servo a stage of Micro-Manager's."""
+    from torch_ecc.commands.stage import run_stage
+
+    with Console(stderr=True).status("looking") as live:
+        result, folder = run_stage(values, lambda step: live.update(str(step)))
+    x, y, _ = result.log.error[-1].tolist()
+    console.print(f"{result.ending.sentence} Last seen {x:+.3f}, {y:+.3f} px off, after {len(result.log.time)} frames.")
+    console.print(f"In {folder}/: " + ", ".join(sorted(path.name for path in folder.iterdir())), soft_wrap=True)
+    if not result.aligned:
+        sys.exit(INTERRUPTED if result.ending.name == "INTERRUPTED" else 1)
 
 
 class _Rate(ProgressColumn):

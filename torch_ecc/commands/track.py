@@ -118,7 +118,8 @@ class Session:
         """What people should know before: what was taken from the file, and what is strange about it."""
         remarks = list(self.source.notes)
         if self.job.fps is None and self.source.fps is not None:
-            remarks.append(f"{self.source.fps:.6g} frames per second, as the file says")
+            who = "camera" if self.source.live else "file"
+            remarks.append(f"{self.source.fps:.6g} frames per second, as the {who} says")
         if self.job.um_per_px is None and self.calibration is not None:
             x, y = self.calibration.scales
             remarks.append(f"{x:.6g} um per px{'' if abs(y) == x else f' in x, {abs(y):.6g} in y'}, as the file says")

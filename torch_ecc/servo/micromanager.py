@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch_ecc.servo.plant import Values
 
 
+@dataclass
 class MicroManagerStage:
     """The current XY stage and camera of a Micro-Manager ``core`` (pymmcore or pymmcore-plus), looking and moving by
     turns: a velocity becomes a move of ``period`` s times as much, and a frame is taken once the stage has arrived.
@@ -18,28 +20,26 @@ class MicroManagerStage:
     high)) um, of both axes, positions that must not be left. ValueError if the core has no such devices.
     """
 
-    def __init__(
-        self,
-        core: Any,
-        *,
-        period: float = 0.1,
-        velocity: float = 50.0,
-        acceleration: float = 1000.0,
-        travel: tuple[tuple[float, float], tuple[float, float]] | None = None,
-    ) -> None:
-        self.core, self.stage, self.period = core, str(core.getXYStageDevice()), period
-        if not self.stage or not core.getCameraDevice():
+    core: Any
+    _: KW_ONLY
+    period: float = 0.1
+    velocity: float = 50.0
+    acceleration: float = 1000.0
+    travel: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+    def __post_init__(self) -> None:
+        self.stage = str(self.core.getXYStageDevice())
+        if not self.stage or not self.core.getCameraDevice():
             raise ValueError("MicroManagerStage: core must have an XY stage and a camera, chosen as its current ones")
-        self._largest, self._travel = (velocity, acceleration), travel
         self._wanted = self._position()
 
     @property
     def limits(self) -> tuple[Values, ...]:
         """See ``Plant``."""
-        most: list[Values] = [(value, value) for value in self._largest]
-        if self._travel is not None:
+        most: list[Values] = [(value, value) for value in (self.velocity, self.acceleration)]
+        if self.travel is not None:
             here = self._position()
-            most.append(torch.tensor(self._travel, dtype=torch.float64) - here[:, None])
+            most.append(torch.tensor(self.travel, dtype=torch.float64) - here[:, None])
         return tuple(most)
 
     def frame(self) -> Tensor:

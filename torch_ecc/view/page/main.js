@@ -3,7 +3,7 @@
 import { Curves } from "./curves.js";
 import { Link } from "./link.js";
 import { Stage } from "./stage.js";
-import { angle, brief, colour, length } from "./words.js";
+import { brief, colour, DEG, physical } from "./words.js";
 
 const $ = (selector, within = document) => within.querySelector(selector);
 const all = (selector) => document.querySelectorAll(selector);
@@ -161,10 +161,16 @@ function row(mark, number) {
   const dot = document.createElement("span");
   dot.className = "dot";
   dot.style.background = colour(number);
-  const size = mark.points ? `${mark.points.length} corners` : `${mark.w}×${mark.h}`;
+  const size = mark.points ? "outline" : `${mark.w}×${mark.h}`;
   const cells = words
     ? [[`${number}`], [size], [words]]
-    : [[`${number}`], [size], length(sigma[0], scales()[0]), length(sigma[1], scales().at(-1)), [angle(sigma[2])]];
+    : [
+        [`${number}`],
+        [size],
+        [brief(sigma[0]), physical(sigma[0], scales()[0])],
+        [brief(sigma[1]), physical(sigma[1], scales().at(-1))],
+        [brief(sigma[2] * DEG)],
+      ];
   for (const [text, small] of cells) {
     const cell = line.insertCell();
     cell.append(text);
@@ -226,6 +232,7 @@ function renderProgress() {
   $("#track").hidden = running();
   $("#track").disabled = state.marks.length === 0;
   $("#stop").hidden = !running();
+  if (!running()) Object.assign($("#stop"), { disabled: false, textContent: "Stop" });
   $("#resume").hidden = running() || state.there !== "unfinished";
   const bar = $("#progress");
   bar.hidden = !running();
@@ -403,8 +410,8 @@ stage.addEventListener("draft", async ({ detail }) => {
 function renderDraft(mark, { sigma, words }) {
   const size = mark.points ? `${mark.points.length} corners` : `${mark.w} × ${mark.h} px`;
   if (words) return tip(words, true);
-  const [x, y] = [length(sigma[0], scales()[0]), length(sigma[1], scales().at(-1))];
-  tip(`${size}\nσ of x  ${x.filter(Boolean).join("  ")}\nσ of y  ${y.filter(Boolean).join("  ")}\nσ of θ  ${angle(sigma[2])}`);
+  const [x, y] = [0, 1].map((k) => `${brief(sigma[k])} px  ${physical(sigma[k], scales().at(-k))}`);
+  tip(`${size}\nσ of x  ${x}\nσ of y  ${y}\nσ of θ  ${brief(sigma[2] * DEG)}°`);
 }
 
 let pointer = [0, 0];
@@ -488,7 +495,10 @@ $("#settings").onchange = ({ target }) => {
   ask("set", { settings: { [target.name]: value } });
 };
 $("#track").onclick = () => ask("track");
-$("#stop").onclick = () => ask("stop");
+$("#stop").onclick = ({ target }) => {
+  Object.assign(target, { disabled: true, textContent: "Stopping ..." }); // the files are made whole
+  ask("stop");
+};
 $("#resume").onclick = () => ask("track", { resume: true });
 all("[data-copy]").forEach((button) => {
   button.onclick = async () => {

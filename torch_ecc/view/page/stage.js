@@ -95,7 +95,7 @@ export class Stage extends EventTarget {
     this.canvas.width = Math.round(width * devicePixelRatio);
     this.canvas.height = Math.round(height * devicePixelRatio);
     if (this.#whole) this.fit();
-    else this.draw();
+    this.#paint(); // a canvas of another size is empty until then
   }
 
   #toFrame(x, y) {

@@ -17,12 +17,9 @@ export function brief(value) {
   return value.toFixed(Math.min(digits, 9));
 }
 
-// Of a sigma in px, and in micrometres or nanometres if the scale is known.
-export function length(px, um) {
-  if (px === null || px === undefined) return ["–", ""];
-  if (!um) return [`${brief(px)} px`, ""];
-  const size = px * um;
-  return [`${brief(px)} px`, size < 0.1 ? `${brief(size * 1000)} nm` : `${brief(size)} µm`];
+// Of a sigma in px: what it is in micrometres or nanometres, if the scale is known.
+export function physical(px, um) {
+  if (!um) return "";
+  const size = Math.abs(px * um);
+  return size < 0.1 ? `${brief(size * 1000)} nm` : `${brief(size)} µm`;
 }
-
-export const angle = (rad) => (rad === null || rad === undefined ? "–" : `${brief(rad * DEG)}°`);
