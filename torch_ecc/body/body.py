@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from torch_ecc.body.layout import Layout, Response
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.pose import compose, inverse, rotation
+from torch_ecc.core.reference import MARGIN
 from torch_ecc.core.verdict import unknown
 from torch_ecc.records.lens import Lens
 from torch_ecc.track.tracker import Tracker
@@ -108,6 +110,7 @@ class Body(nn.Module):
         start = tracker.start
         groups = [range(len(start))] if groups is None else groups
         _check_groups(groups, len(start))
+        _warn_of_overlap(groups, start, [n - 2 * MARGIN for n in tracker.template.shape[2:]])
         self.tracker, self.layout = tracker, layout_of(tracker, groups, lens)
         self.register_buffer("before", self.layout.start.clone())  # the last good poses, (G, 3)
         self.register_buffer("found", self.layout.start.new_ones(len(groups), dtype=torch.int8))  # in the last frame
@@ -171,6 +174,16 @@ def record(found: Fusion, good: Tensor, layout: Layout, last: Tensor) -> BodyEst
     used = found.weight >= USED
     moved = pose - layout.start
     return BodyEstimate(pose, moved, covariance, found.chi2, found.freedom, used, found.weight, residual, status)
+
+
+def _warn_of_overlap(groups: Sequence[Sequence[int]], start: Tensor, size: Sequence[int]) -> None:
+    for g, group in enumerate(groups):
+        at = start[list(group), :2]
+        apart = (at[:, None] - at).abs() >= at.new_tensor((size[1], size[0]))
+        shared = (~apart.any(2)).sum() - len(group)
+        if int(shared) > 0:
+            words = "share pixels, whose noise then counts twice: sigma tells too little"
+            warnings.warn(f"Body: {int(shared) // 2} pairs of patches of group {g} {words}", stacklevel=3)
 
 
 def _check_groups(groups: Sequence[Sequence[int]], count: int) -> None:

@@ -1,7 +1,7 @@
 """Where a body turns: the point of it that stays where it is, and whether there is one (parasitic motion, Fig. 9).
 
 A point x of a body that turns about a fixed centre c is at c + R(theta) a. Fitted are c and a; errors of theta count
-with the arm a. What the templates' noise adds is the same in all frames and goes into a: the frames' part scatters.
+with the arm a. What the templates' noise adds is the same in all frames and goes into a: only the frames' scatters.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.pose import compose, inverse, transform
 
-MOST = 60  # frames, evenly spread, that are compared
+MOST = 30  # frames, evenly spread, that are compared
 FEWEST_FRAMES = 3  # in which a patch was found
 FEWEST = 2  # patches of a body
 SLACK = (0.05, 0.004)  # px, rad: errors of real patches that their covariances do not know, as of light and edges,
@@ -26,7 +26,7 @@ RELATIVE = 0.03  # and share of the way that patches have gone: lenses, and heig
 EXPLAINED = 8.0  # mean of squared distances, two components of which would be chance
 FARTHEST = 60.0  # squared distances count so much at most: a frame that went wrong is no other body
 ROUNDS = 6
-AT_ONCE = 16  # hypotheses
+HYPOTHESES, AT_ONCE = 160, 16  # patches whose own motion is tried for a body
 
 
 class Groups(NamedTuple):
@@ -75,17 +75,16 @@ def rigid_groups(track: Estimate, bodies: int) -> Groups:
     if not isinstance(bodies, int) or bodies < 1:
         raise ValueError(f"rigid_groups: bodies must be a whole number of at least 1, got {bodies!r}")
     seen = _sampled(track)
-    standing = _still(seen)
-    free, found = seen.good.sum(0) >= FEWEST_FRAMES, list[Tensor]()
-    still = int(((_misfit(seen, standing)[0] < EXPLAINED) & free).sum()) >= FEWEST
-    if still:
-        free &= _misfit(seen, standing)[0] >= EXPLAINED
-    while len(found) < bodies and int(free.sum()) >= FEWEST:
-        members = _largest(seen, free)
+    usable, standing, found = seen.good.sum(0) >= FEWEST_FRAMES, _still(seen), list[Tensor]()
+    known = _misfit(seen, standing)[0].clamp(max=FARTHEST)  # by what there is so far
+    still = int(((known < EXPLAINED) & usable).sum()) >= FEWEST
+    known = known if still else torch.full_like(known, FARTHEST)
+    while len(found) < bodies:
+        members = _largest(seen, usable & (known >= EXPLAINED), known)
         if members is None:
             break
         found.append(members)
-        free &= ~members
+        known = torch.minimum(known, torch.where(members, 0.0, FARTHEST))
     if not found and not still:
         raise ValueError("rigid_groups: no two patches move together")
     return _competing(seen, found, standing if still else None)
@@ -95,13 +94,14 @@ def _sampled(track: Estimate) -> _Seen:
     some = torch.linspace(0, len(track.pose) - 1, min(MOST, len(track.pose))).round().long().to(track.pose.device)
     pose, covariance, status = track.pose[some], track.covariance[some], track.status[some]
     good = (status == Status.CONVERGED) & covariance.isfinite().flatten(2).all(2)
+    start = (track.pose - track.displacement).nanmedian(0).values  # the same in all frames in which it is told
+    pose = torch.where(good[..., None], pose, start)
     covariance = torch.where(good[..., None, None], covariance, 0.0)
-    moved = RELATIVE * track.displacement[some]
+    moved = RELATIVE * (pose - start)
     way = torch.linalg.vector_norm(moved[..., :2], dim=-1)
     slack = torch.stack((way, way, moved[..., 2]), -1).square() + pose.new_tensor((*SLACK[:1], *SLACK)).square()
     covariance = covariance + torch.diag_embed(slack)
     place = covariance[..., 0, 0] + covariance[..., 1, 1]
-    start = (track.pose - track.displacement)[0]
     return _Seen(pose, covariance, place / 2, covariance[..., 2, 2], good, start)
 
 
@@ -149,14 +149,18 @@ def _misfit(seen: _Seen, motion: _Motion) -> Tensor:
     return torch.where(count >= FEWEST_FRAMES, mean, torch.inf)
 
 
-def _largest(seen: _Seen, free: Tensor) -> Tensor | None:
-    """The most of the ``free`` patches (R,) that one motion explains, (R,) bool; None if there are no two."""
+def _largest(seen: _Seen, free: Tensor, known: Tensor) -> Tensor | None:
+    """The ``free`` patches (R,) that one motion explains, (R,) bool: the one by which most is explained better than it
+    is ``known`` (R,); None if there are no two."""
     best, most = None, 0.0
-    for some in free.nonzero()[:, 0].split(AT_ONCE):
-        share = (1 - _misfit(seen, _of_patches(seen, some)) / EXPLAINED).clamp(min=0) * free
-        value, which = share.sum(1).max(0)
-        if float(value) > most and int((share[which] > 0).sum()) >= FEWEST:
-            best, most = share[which] > 0, float(value)
+    patches = free.nonzero()[:, 0]
+    spread = torch.linspace(0, len(patches) - 1, min(HYPOTHESES, len(patches)), device=patches.device).round().long()
+    for some in patches[spread].split(AT_ONCE) if len(patches) else ():
+        misfit = _misfit(seen, _of_patches(seen, some))
+        explained = (misfit < EXPLAINED) & free
+        value, which = ((known - misfit).clamp(min=0) * explained).sum(1).max(0)
+        if float(value) > most and int(explained[which].sum()) >= FEWEST:
+            best, most = explained[which], float(value)
     for _ in range(ROUNDS):
         if best is None:
             return None

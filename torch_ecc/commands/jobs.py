@@ -73,6 +73,10 @@ class TrackJob(Tracking):
     grid: int | None = described(
         None, "this many templates of that size in a row, and rows to match, where there is texture", example=8
     )
+    body: bool = described(False, "all templates are one rigid body: its pose goes into body.csv")
+    bodies: int | None = described(
+        None, "so many rigid bodies that move, told apart by their motion, beside what stands still", example=2
+    )
     reference: str | None = described(
         None, "image to cut the templates from; without it, the first frame of the input", example="first.png"
     )
@@ -118,6 +122,10 @@ class TrackJob(Tracking):
         super().__post_init__()
         _check_rate(self.fps)
         span(self.frames)
+        if self.body and self.bodies is not None:
+            raise ValueError("body: not with bodies, which tells the templates apart first")
+        if self.bodies is not None and self.bodies < 1:
+            raise ValueError(f"bodies: expected at least 1, got {self.bodies}")
 
     def calibration(self, of_file: Point | None = None) -> Calibration | None:
         """Pixels to micrometres, None if neither the job nor the file tells the scale."""

@@ -18,6 +18,9 @@ from torch_ecc.core.patches import texture
 from torch_ecc.io import open_frames
 from torch_ecc.search.locate import Located
 
+LEAST_PRECISE = 0.05  # px: patches of a body that tell less of where they are only take time
+TRIED = 4  # places across, and down, of each field of a grid, for the best patch of a body
+
 
 class Templates(NamedTuple):
     """Centres (R, 2) px, common size (h, w) px and masks (R, h, w) or None."""
@@ -133,10 +136,35 @@ def grid_templates(job: TrackJob, frame: Tensor) -> Templates:
     )
     x, y = x.clamp((w - 1) / 2, width - (w + 1) / 2), y.clamp((h - 1) / 2, height - (h + 1) / 2)
     centers = torch.cartesian_prod(y, x).flip(1).reshape(-1, 2)
+    if job.body or job.bodies is not None:
+        room = (width / job.grid - w, height / rows - h)
+        return _best_in_fields(frame, centers, (h, w), room, job)
     kept = texture(frame, centers, (h, w), criterion=job.criterion).isfinite().all(1)
-    if not kept.any():
-        raise ValueError(f"grid: none of the {len(centers)} patches has enough texture to fix x, y and theta")
+    _refuse_none(kept)
     return Templates(centers[kept], (h, w), None)
+
+
+def _best_in_fields(
+    frame: Tensor, middles: Tensor, size: tuple[int, int], room: tuple[float, float], job: TrackJob
+) -> Templates:
+    """The patch of each field around ``middles`` (N, 2) that tells most of x and y, ``room`` px wide and high for its
+    centre to be in: they stay apart, and as far as the fields. Fields without much texture have none."""
+    steps = torch.linspace(-0.5, 0.5, TRIED, dtype=torch.float64)
+    offsets = torch.cartesian_prod(steps, steps).flip(1) * torch.tensor(room, dtype=torch.float64).clamp(min=0).floor()
+    tried = (middles[:, None] + offsets).round()
+    low = torch.tensor(((size[1] - 1) / 2, (size[0] - 1) / 2)).double()
+    high = torch.tensor((frame.shape[-1], frame.shape[-2])).double() - 1 - low
+    tried = tried.clamp(low.ceil(), high.floor())
+    sigma = texture(frame, tried.flatten(0, 1), size, criterion=job.criterion).unflatten(0, tried.shape[:2])
+    spread, best = sigma[..., :2].square().sum(-1).min(1)
+    kept = spread < LEAST_PRECISE**2
+    _refuse_none(kept)
+    return Templates(tried[torch.arange(len(tried)), best][kept], size, None)
+
+
+def _refuse_none(kept: Tensor) -> None:
+    if not kept.any():
+        raise ValueError(f"grid: none of the {len(kept)} patches has enough texture to fix x, y and theta")
 
 
 def _rasterise(polygon: NDArray[np.float64], corner: NDArray[np.float64], size: tuple[int, int]) -> Tensor:

@@ -15,6 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_ecc.body.body import Body
+from torch_ecc.commands.bodies import BODY_FILES, drawn_with, told, write_bodies
 from torch_ecc.commands.jobs import TrackJob, span
 from torch_ecc.commands.live import Latency, Send, sender
 from torch_ecc.commands.templates import Templates, choose_templates, read_frame_mask, read_templates, refuse_doubt
@@ -35,7 +37,7 @@ Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 
 STATUS_NAMES = {int(code): code.name for code in Status}
 REASON_NAMES = {int(code): code.word for code in Reason}
-RESULTS = (*FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
+RESULTS = (*FILES, *BODY_FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
 NOT_OF_THE_RESULT = ("out", "force", "resume", "send")
 CONSTANT = ("template", "mask", "centre", "first", *LESSONS)  # of a tracker's state, or too large for a journal
 
@@ -68,7 +70,7 @@ class Finished(NamedTuple):
         if reasons := [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]:
             rows, doubted = int(self.reasons.sum()), int(self.reasons[1:].sum())
             said.append(f"{doubted} of {rows} rows are not to be trusted: {', '.join(reasons)}")
-        said += self.latency.words()
+        said += [*told(self.folder), *self.latency.words()]
         whole = sorted(path.name for path in self.folder.iterdir() if path.suffix != ".part") if self.frames else []
         end, names = "Stopped after" if self.interrupted else "Tracked", ", ".join(whole) or "nothing"
         return [*said, f"{end} {self.frames} frames. In {self.folder}/: {names}"]
@@ -110,7 +112,10 @@ class Session:
                 near = torch.tensor(job.centers).double() if job.centers else None
                 self.tracker, located = Tracker.find(crops, first, near=near, **options)
                 refuse_doubt(located, near is not None)
-        self.settings = settings_of(job, first)
+        self.body = Body(self.tracker) if job.body else None
+        if job.bodies is not None and len(centers) < 2:
+            raise ValueError(f"bodies: expected two templates or more, got {len(centers)}")
+        self.settings, self.first = settings_of(job, first), first
         if self.source.live:
             self.tracker(first)  # the first frame takes longer than all others, and a camera does not wait
 
@@ -141,7 +146,7 @@ class Session:
         with claim(self.folder):
             films = [film for film in (self._overlay(), self._stabilised()) if film is not None]
             left = self._left(films)
-            run = _Run(self.tracker, self._track_writer(left), films, stop_at_damage=self.job.stop_at_damage)
+            run = _Run(self, self._track_writer(left), films)
             if left is not None:
                 run.go_on(left.records(self.folder))
             stopped: BaseException | None = None
@@ -154,6 +159,7 @@ class Session:
                 raise _told(error, run.done) from error
             if run.done:
                 self._plot()
+                self._write_bodies()
                 self._remove_old({film.film.name for film in films})
             if isinstance(stopped, ValueError):
                 raise stopped
@@ -164,7 +170,7 @@ class Session:
         leave them there as a run that was ended before its time: without results, to go on with."""
         with claim(self.folder):
             left = self._left([])
-            run = _Run(self.tracker, self._track_writer(left), [], stop_at_damage=self.job.stop_at_damage)
+            run = _Run(self, self._track_writer(left), [])
             if left is not None:
                 run.go_on(left.records(self.folder))
                 first = _last(left, self.folder) + 1
@@ -172,6 +178,13 @@ class Session:
                 run.through(ahead(self.source.between(first, last)), progress)
             finally:
                 run.track.leave()
+
+    def _write_bodies(self) -> None:
+        """body.csv, body.json and body.png, if there are bodies."""
+        for name in BODY_FILES:
+            (self.folder / name).unlink(missing_ok=True)
+        if self.job.body or self.job.bodies is not None:
+            write_bodies(self.folder, self.tracker, self.job.bodies, self._um_matrix(), self.first)
 
     def _remove_old(self, films: set[str]) -> None:
         """What a result before had and this one does not."""
@@ -219,7 +232,15 @@ class Session:
         if not self.job.overlay:
             return None
         um, shapes, fps = self._um_matrix(), self.templates.shapes, self.source.fps
+        if self.body is not None:
+            shapes.append(self._body_size())
         return OverlayWriter(self.folder, shapes=shapes, status_names=STATUS_NAMES, fps=fps, um_matrix=um)
+
+    def _body_size(self) -> tuple[int, int]:
+        """Height and width that all templates take, px."""
+        extent = (self.templates.centers.amax(0) - self.templates.centers.amin(0)).round().long().tolist()
+        h, w = self.templates.size
+        return extent[1] + h, extent[0] + w
 
     def _stabilised(self) -> StabilisedWriter | None:
         """Of stabilised.mp4, if that is wanted."""
@@ -240,13 +261,15 @@ class Session:
 class _Run:
     """The files and the counts of a run, as ``Finished`` has them."""
 
-    def __init__(self, tracker: Tracker, track: TrackWriter, films: list[Pictures], *, stop_at_damage: bool) -> None:
-        self.tracker, self.track, self.films, self.stop_at_damage = tracker, track, films, stop_at_damage
+    def __init__(self, session: Session, track: TrackWriter, films: list[Pictures]) -> None:
+        self.tracker, self.track, self.films, self.body = session.tracker, track, films, session.body
+        self.stop_at_damage, tracker = session.job.stop_at_damage, session.tracker
         self.latency = Latency()
         self.done, self.damaged, self.reasons = 0, 0, np.zeros(len(Reason), np.int64)
         self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
         # What the next frame depends on: all of it goes into the journal with every frame.
         self._state = state_of(tracker)
+        self._state += [] if self.body is None else list(self.body.buffers(recurse=False))
         self._views = [part.numpy() for part in self._state if part.device.type == "cpu"]  # they see what is written
         for film in films:
             film.film.resumable = True
@@ -286,10 +309,11 @@ class _Run:
 
     def write(self, frame: Frame, estimate: Estimate) -> None:
         """Append what was found in a frame to all files."""
+        shown = estimate if self.body is None else drawn_with(self.body(estimate), estimate)
         views = self._views or [part.cpu().numpy() for part in self._state]
         self.track.write(estimate, frame, b"".join(view.tobytes() for view in views))
         for film in self.films:
-            film.write(frame, estimate)
+            film.write(frame, shown if isinstance(film, OverlayWriter) else estimate)
         self._count(*(code.cpu().numpy()[None] for code in (estimate.status, estimate.reason)))
 
     @property
@@ -311,7 +335,10 @@ class _Run:
         restore(self._state, np.array(records["state"][-1]).tobytes())
         status = np.array(records["status"])
         for film in self.films:
-            film.go_on(np.array(records["pose"]), status <= Status.MAX_ITERATIONS)
+            pose, found = np.array(records["pose"]), status <= Status.MAX_ITERATIONS
+            if self.body is not None and isinstance(film, OverlayWriter):  # the body, too, whose trail begins anew
+                pose, found = np.pad(pose, ((0, 0), (0, 1), (0, 0))), np.pad(found, ((0, 0), (0, 1)))
+            film.go_on(pose, found)
         self._count(status, np.array(records["reason"]))
 
 
