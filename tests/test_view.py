@@ -179,6 +179,7 @@ def test_what_does_not_fit_changes_nothing(video):
         (lambda: desk.set({"frames": "9:3"}), "LAST not to be before FIRST"),
         (lambda: desk.set({"frames": "90:"}), "holds none of the frames"),
         (lambda: desk.set({"fps": -1}), "expected a rate > 0 in Hz, got -1"),
+        (lambda: desk.set({"um_per_px": 0}), "finite numbers other than 0, got 0"),
         (lambda: desk.set({"device": "cuda"}), "expected some of frames, fps"),
         (lambda: desk.grid(2, 300), "300x300 px each, within 160x120 px"),
         (lambda: desk.mark([{"x": "left", "y": 0, "w": 9, "h": 9}]), "centers"),

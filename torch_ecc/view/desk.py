@@ -42,6 +42,7 @@ class Desk:
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.values, self.version = dict(values), 0
         self.marks, self.outlooks = list[Mark](), list[Outlook]()
+        self.tracked: list[Mark] | None = None  # those that the rows are of
         self.history: History | None = None
         self.run: Run | None = None
         self.problem: str | None = None
@@ -53,6 +54,7 @@ class Desk:
             self._look(self.job, _opened(self.job))
             self.stretch = Stretch.of(self.source.first)
             self._read_marks()
+            self.tracked = self.marks if self.history is not None else None
         except FALLEN as error:
             self.problem = str(error)
 
@@ -86,8 +88,15 @@ class Desk:
     def _change(self, values: Mapping[str, Any]) -> None:
         """Take these values, if they fit."""
         values = {name: value for name, value in values.items() if value not in (None, "", [], DEFAULTS.get(name))}
-        self.job, self.values = fill(TrackJob, values, "pick"), values
+        job = self._job(values)
+        self.job, self.values, self.calibration = job, values, job.calibration(self.source.um_per_px)
         self.version += 1
+
+    def _job(self, values: Mapping[str, Any]) -> TrackJob:
+        """What these values say. ValueError if they do not fit."""
+        job = fill(TrackJob, values, "pick")
+        job.calibration(self.source.um_per_px)
+        return job
 
     def _place(self, values: Mapping[str, Any], marks: list[Mark]) -> None:
         """Take the values that say these marks, and what is to be expected of each, all at once."""
@@ -120,6 +129,8 @@ class Desk:
             "first": self.first,
             "marks": self.marks,
             "outlooks": [each._asdict() for each in self.outlooks],
+            "tracked": self.tracked,
+            "ready": bool(self.marks or self.job.template),
             "command": track_command(self.values),
             "toml": track_toml(self.values, "pick"),
             "folder": str(folder),
@@ -142,10 +153,9 @@ class Desk:
         return "unfinished" if left else "result" if any((folder / name).exists() for name in RESULTS) else "nothing"
 
     def _um_matrix(self) -> list[list[float]] | None:
-        calibration = self.job.calibration(self.source.um_per_px)
-        if calibration is None:
+        if self.calibration is None:
             return None
-        return calibration.matrix(torch.zeros(1, dtype=torch.float64))[:2, :2].tolist()
+        return self.calibration.matrix(torch.zeros(1, dtype=torch.float64))[:2, :2].tolist()
 
     @property
     def rows(self) -> History | None:
@@ -194,7 +204,7 @@ class Desk:
         if unknown:
             raise ValueError(f"set: expected some of {', '.join(SETTINGS)}, got {', '.join(sorted(unknown))}")
         values = self.values | dict(settings)
-        job = fill(TrackJob, values, "pick")
+        job = self._job(values)
         self._look(job, self.source if job.fps == self.job.fps else _opened(job))
         self._place(values, self.marks)
 
@@ -210,6 +220,7 @@ class Desk:
         if self.running:
             raise ValueError("track: a run is going on already")
         self.run = Run(fill(TrackJob, self.values | {"resume": resume}, "pick"))
+        self.tracked = self.marks
         self.version += 1
 
     def stop(self) -> None:
@@ -222,8 +233,10 @@ class Desk:
         """A frame as JPEG. ValueError in words if it is damaged or there is none."""
         if self.source.live and number != self.first:
             raise ValueError("pictures of a camera are not kept; overlay.mp4 has them")
+        if number == self.first and (self.source.live or self.job.reference):
+            return jpeg(Frame(number, self.frame), self.stretch)
         try:
-            frame = Frame(number, self.frame) if number == self.first else self.source[number]
+            frame = self.source[number]
         except IndexError as error:
             raise ValueError(str(error)) from error
         return jpeg(frame, self.stretch)

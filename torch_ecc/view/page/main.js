@@ -15,6 +15,8 @@ let state = null;
 let cursor = 0; // the number of the frame that is shown
 let following = false; // the run's last picture is shown, whichever it is
 let loading = false; // a frame is on its way
+let marking = 0; // how many changes of the marks are on their way to the server
+let marked = []; // the marks as the server has them
 let mapped = null; // the size and the frame of the map that is shown
 
 const running = () => state?.run?.state === "running";
@@ -28,6 +30,8 @@ link.addEventListener("up", () => ($("#line").textContent = ""));
 link.addEventListener("state", ({ detail }) => {
   const before = state;
   state = detail.state;
+  marked = state.marks;
+  if (marking > 0 && before) state.marks = before.marks; // ours are on their way
   $("#problem").hidden = state.problem === null;
   $("main").hidden = state.problem !== null;
   if (state.problem !== null) {
@@ -120,9 +124,7 @@ function render() {
     .filter(Boolean)
     .join(" · ");
   stage.setFrame(width, height);
-  stage.marks = state.marks;
-  stage.starts = state.start;
-  if (stage.selected >= state.marks.length) stage.selected = -1;
+  if (stage.selected >= Math.max(state.marks.length, state.tracked?.length ?? 0)) stage.selected = -1;
   curves.um = state.um_matrix;
   $("#slider").max = (state.length ?? 1) - 1;
   $("#look").hidden = !state.live || running();
@@ -132,7 +134,7 @@ function render() {
   renderSettings();
   renderProgress();
   renderShown();
-  $("#repeat").hidden = state.marks.length === 0;
+  $("#repeat").hidden = !state.ready;
   $("#command").textContent = state.command;
   $("#toml").textContent = state.toml;
   if ($("#map").checked) renderMap();
@@ -230,7 +232,7 @@ function renderProgress() {
   const run = state.run;
   stage.editable = !running() && cursor === state.first;
   $("#track").hidden = running();
-  $("#track").disabled = state.marks.length === 0;
+  $("#track").disabled = !state.ready;
   $("#stop").hidden = !running();
   if (!running()) Object.assign($("#stop"), { disabled: false, textContent: "Stop" });
   $("#resume").hidden = running() || state.there !== "unfinished";
@@ -273,9 +275,11 @@ function renderShown(exact = null) {
   const near = exact ?? curves.at(cursor);
   const found = near && near[0] === cursor ? near : null;
   stage.editable = !running() && cursor === state.first;
-  stage.poses = found ? state.marks.map((_, r) => pose(found, r)) : null;
-  stage.doubted = found ? state.marks.map((_, r) => found[11 + 10 * r] > 0) : [];
-  if (cursor === state.first && !running() && !curves.rows.length) stage.poses = null;
+  const fresh = cursor === state.first && !running(); // what is marked is shown, else what the rows are of
+  stage.marks = fresh ? state.marks : (state.tracked ?? state.marks);
+  stage.starts = fresh ? null : state.start;
+  stage.poses = found && !fresh ? stage.marks.map((_, r) => pose(found, r)) : null;
+  stage.doubted = found && !fresh ? stage.marks.map((_, r) => found[11 + 10 * r] > 0) : [];
   stage.draw();
   curves.cursor = found ? cursor : null;
   curves.draw();
@@ -379,10 +383,16 @@ function heat(part) {
 
 // ---- what people do
 
-stage.addEventListener("change", ({ detail: marks }) => {
+stage.addEventListener("change", ({ detail: marks }) => mark(marks));
+
+async function mark(marks) {
   state.marks = marks;
-  ask("mark", { marks });
-});
+  marking++;
+  await ask("mark", { marks });
+  if (--marking > 0) return;
+  state.marks = marked;
+  render();
+}
 stage.addEventListener("select", () => {
   described = null;
   renderSelected();
@@ -468,13 +478,13 @@ $("#on").onclick = () => seek(cursor + 1);
 $("#follow").onclick = () => ((following = true), renderShown());
 $("#look").onclick = () => ask("look");
 $("#here").onclick = () => ask("set", { settings: { frames: `${cursor}:` } });
-$("#clear").onclick = () => ask("mark", { marks: [] });
+$("#clear").onclick = () => mark([]);
 curves.addEventListener("seek", ({ detail }) => seek(detail));
 
 $("#selected").onsubmit = (event) => event.preventDefault();
 $("#selected").onchange = ({ target }) => {
-  const mark = { ...state.marks[stage.selected], [target.name]: Number(target.value) };
-  ask("mark", { marks: state.marks.with(stage.selected, mark) });
+  const changed = { ...state.marks[stage.selected], [target.name]: Number(target.value) };
+  mark(state.marks.with(stage.selected, changed));
 };
 $("#many").onsubmit = (event) => {
   event.preventDefault();
@@ -482,7 +492,7 @@ $("#many").onsubmit = (event) => {
   if (event.submitter.value !== "one") return ask(event.submitter.value, { count, size });
   const [x, y] = stage.middle();
   stage.selected = state.marks.length;
-  ask("mark", { marks: [...state.marks, { x, y, w: size, h: size }] });
+  mark([...state.marks, { x, y, w: size, h: size }]);
 };
 $("#paste").onsubmit = async (event) => {
   event.preventDefault();
