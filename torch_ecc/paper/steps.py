@@ -17,7 +17,7 @@ from torch_ecc.paper.result import Advance, Table, cells, counter
 from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Dwells, Motion, dwell_errors
 from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
-from torch_ecc.sim import GradientLight, LampDrift, Lights
+from torch_ecc.sim import GradientLight, LampDrift, Lights, Microscope
 
 STEP_DEG, HIGHEST = 0.04, 6
 LEVELS = torch.tensor((*range(HIGHEST + 1), *range(HIGHEST - 1, -1, -1)), dtype=torch.float64)  # in steps
@@ -73,6 +73,11 @@ def staircase(quick: bool, advance: Advance) -> Staircase:
     frames = Bench(view).frames(path)
     light = Lights((GradientLight(), LampDrift(LAMP, period=2.2 * frames)))
     acquired = Bench(view, light, GAIN, METHODS).acquire(path, counter(frames, advance))
+    return compared(acquired, view, dwell_s)
+
+
+def compared(acquired: Acquisition, view: Microscope, dwell_s: float) -> Staircase:
+    """The dwells of ``dwell_s`` of all records of a staircase that a microscope has seen, on one clock."""
     angle, rest = view.axis_angle, dwell_s / 4  # the angle is known from the circles
     turn, calibration = Calibration(1.0, angle), Calibration(view.um_per_px, angle)
     sensors = zeroed(acquired.sensors, rest)

@@ -1,0 +1,308 @@
+"""Rigid bodies of many patches: python benchmarks/body.py [--draws N] [--only SECTION]... [--quick] [--data DATA]
+
+Sections: the scatter of x, y, theta over the bound of all patches together, and its honesty; five of sixteen patches
+that are covered, have jumped, or are on another body; a lens, unknown, known and self-calibrated, and moves that do not
+tell it; frames per second beside a loop over OpenCV's ECC; Figs. 10 and 11 with a body; the clockwork's three bodies.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import cv2
+import torch
+from results import save
+from rich.console import Console
+from rich.table import Table
+from rigid import Drawn, Near, Plan, draw
+from rivals import rivals
+from scaling import slope
+from staircase import climbed
+from torch import Tensor
+
+import torch_ecc as te
+from torch_ecc.core.pose import compose, inverse, transform
+from torch_ecc.paper.bound import cramer_rao, rounding
+from torch_ecc.paper.errors import box, largest, rms
+from torch_ecc.paper.result import Number
+from torch_ecc.sim import Camera, PlaneWaves, harmonic, placed
+
+APART = (0, 1, 5, 10, 15)
+UM_PER_PX = 0.55  # of the paper's camera at 10 x
+console = Console(width=150)
+
+
+def show(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    table = Table(*header, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def scatters(draws: int) -> list[Number]:
+    rows, figures = [], []
+    for plan, noise, count in (
+        (Plan(), 2.0, draws),
+        (Plan(), 5.0, draws),
+        (Plan(2048, 8, 61, 1700), 2.0, max(draws // 5, 10)),
+    ):
+        found, bound = draw(plan, noise, count), plan.bound(noise)
+        words = f"{plan.side}^2, {plan.across**2} patches, noise {noise:g}"
+        one = float(cramer_rao(SCENE, (121, 121), 2 * (noise**2 + rounding(8)))[2])
+        theta, ratio = 1e6 * float(rms(found.error)[2]), rms(found.error) / bound
+        told = (f"{theta:.2f}", f"{1e6 * float(bound[2]):.2f}", f"{1e6 * one:.1f}", f"{1e6 * one / theta:.1f}")
+        honest = f"{float(found.nees.mean()):.2f}"
+        cells = tuple(f"{v:.2f}" for v in ratio.tolist())
+        rows.append((words, str(count), *told, *cells, honest, f"{float(found.chi2.mean()):.2f}"))
+        figures += [
+            Number(f"{words} / theta over the bound", float(ratio[2]), "x", "lower", 0.1),
+            Number(f"{words} / theta", theta, "urad", "lower", 0.1),
+            Number(f"{words} / x, y over the bound", float(ratio[:2].max()), "x", "lower", 0.1),
+            Number(f"{words} / normalised error squared", float(found.nees.mean()), "", "lower", 0.15),
+        ]
+    header = ("", "draws", "theta urad", "bound", "one of 121 px", "times better")
+    header += ("x / bound", "y / bound", "theta / bound", "NEES", "chi2 / freedom")
+    show("Scatter", header, rows)
+    return figures
+
+
+SCENE = PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0)
+
+
+def apart(draws: int) -> list[Number]:
+    rows, figures = [], []
+    plan = Plan()
+    left = torch.ones(16, dtype=torch.bool)
+    left[list(APART)] = False
+    bound = plan.bound(2.0, left)
+    for wrong in ("covered", "jumped", "another body"):
+        found: Drawn = draw(plan, 2.0, draws, wrong, APART)
+        ratio = rms(found.error) / bound
+        named = float((~found.used[:, ~left]).all(1).double().mean())
+        kept = float(found.used[:, left].double().mean())
+        rows.append((wrong, *(f"{v:.2f}" for v in ratio.tolist()), f"{100 * named:.1f} %", f"{100 * kept:.2f} %"))
+        rows[-1] += (f"{float(found.nees.mean()):.2f}",)
+        figures += [
+            Number(f"5 of 16 {wrong} / over the bound of the others", float(ratio.max()), "x", "lower", 0.1),
+            Number(f"5 of 16 {wrong} / the five named", named, "", "higher", 0.01),
+        ]
+    header = ("5 of 16", "x / bound of 11", "y / bound", "theta / bound", "all five named", "others used", "NEES")
+    show(f"Patches that are wrong, noise 2, {draws} draws", header, rows)
+    return figures
+
+
+def lenses(frames: int) -> list[Number]:
+    """A body moved over half the view and turned by 3 deg behind a lens that moves the corner by 0.5 %."""
+    plan = Plan(span=480)
+    lens = te.Lens((511.5, 511.5), math.hypot(1023, 1023) / 2, 0.005)
+    angle = math.tau * torch.arange(frames, dtype=torch.float64) / frames
+    path = torch.stack((170 * angle.cos(), 170 * angle.sin(), math.radians(3) * (2 * angle).sin()), 1) + plan.middle
+    tracker, track = _followed(plan, lens, path)
+    fit = te.calibrate(track, tracker=tracker)
+    assert isinstance(fit, te.SelfCalibration)
+    rows, figures = [], []
+    for name, one in (("none", None), ("self-calibrated", fit.lens), ("known", lens)):
+        error, residual = _behind(te.Body(tracker, lens=one), te.Body(tracker, lens=lens), track, path, plan)
+        px = float(rms(error[:, :2].flatten()))
+        rows.append(
+            (
+                name,
+                f"{px:.5f}",
+                f"{1e3 * UM_PER_PX * px:.2f}",
+                f"{1e6 * float(rms(error[:, 2])):.2f}",
+                f"{residual:.5f}",
+            )
+        )
+        figures.append(Number(f"lens of 0.5 %, {name} / body", px, "px", "lower", 0.1))
+        figures.append(Number(f"lens of 0.5 %, {name} / patches", residual, "px", "lower", 0.1))
+    show(
+        f"A lens of 0.5 %, {frames} frames: {fit}", ("lens", "body px rms", "nm", "theta urad", "patches px rms"), rows
+    )
+    line = plan.middle + torch.linspace(-170, 170, 6, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    for words, moves, commanded in (("one direction", line, True), ("no move", line[:1].expand(6, 3), False)):
+        tracker, track = _followed(plan, lens, moves)
+        sent = UM_PER_PX * (moves - plan.middle)[:, :2] if commanded else None
+        try:
+            console.print(f"{words}: {te.calibrate(track, sent, tracker=tracker)}")
+        except ValueError as error:
+            console.print(f"{words}: {error}")
+    return figures
+
+
+def _followed(plan: Plan, lens: te.Lens, path: Tensor) -> tuple[te.Tracker, te.Track]:
+    centers = plan.places + plan.middle[:2]
+    near = Near(lens, transform(inverse(plan.middle), lens.undistort(centers)), plan.size // 2 + 16)
+    camera = Camera(size=(plan.side, plan.side), noise_sigma=2.0)
+    frames = [camera.capture(near, pose[None], seed=k)[0, 0] for k, pose in enumerate((plan.middle, *path))]
+    tracker = te.Tracker(frames[0], centers, plan.size)
+    return tracker, tracker.track_sequence(frames[1:])
+
+
+def _behind(body: te.Body, true: te.Body, track: te.Track, path: Tensor, plan: Plan) -> tuple[Tensor, float]:
+    """Errors (F, 3) of the displacement, and the rms of the patches' residuals."""
+    found, start = body(track), true.layout.start[0]
+    moved = compose(path, compose(inverse(plan.middle), start).expand_as(path)) - start
+    return found.displacement[:, 0] - moved, float(rms(found.residual[..., :2].flatten()))
+
+
+def speed(rounds: int) -> list[Number]:
+    """640 x 480, patches of 51 px that do not overlap; OpenCV's ECC on the same patches in a loop."""
+    torch.set_num_threads(2)
+    cv2.setNumThreads(2)
+    figures, rows, taken = [], [], dict[int, float]()
+    path = placed(harmonic((6.0, 6.0, 0.02), 30), (320.0, 240.0))[: rounds + 4]
+    frames = list(Camera(noise_sigma=2.0).capture(SCENE, path)[:, 0])
+    for across, down in ((4, 4), (8, 4), (8, 8)):
+        centers = _grid(across, down, 640, 480)
+        trackers = [te.Tracker(frames[0], centers, 51) for _ in range(2)]
+        body = te.Body(trackers[0])
+        both, alone, theirs = [], [], []
+        peers = [rivals()["OpenCV ECC, fastest fair"].start(frames[0], (x, y), 51) for x, y in centers.tolist()]
+        for k, frame in enumerate(frames[1:]):
+            both.append(_timed(lambda f=frame: body(trackers[0](f))))
+            alone.append(_timed(lambda f=frame: trackers[1](f)))
+            if k % 4 == 0:
+                theirs.append(_timed(lambda f=frame: [one(f) for one in peers]))
+        a, b, c = (1 / statistics.median(v[2:] or v) for v in (both, alone, theirs))
+        taken[len(centers)] = 1 / a
+        rows.append((str(len(centers)), f"{a:.0f}", f"{b:.0f}", f"{1e3 / a - 1e3 / b:.2f}", f"{c:.1f}", f"{a / c:.1f}"))
+        figures.append(Number(f"{len(centers)} patches and their body / over OpenCV's", a / c, "x", "higher", 0.5))
+    header = ("patches", "with body 1/s", "without 1/s", "body ms", "OpenCV 1/s", "times faster")
+    show("640 x 480, two threads", header, rows)
+    console.print(f"slope over patches: {slope(taken, taken.values()):.2f}")
+    return figures + _large(rounds)
+
+
+def _large(rounds: int) -> list[Number]:
+    path = placed(harmonic((6.0, 6.0, 0.005), 30), (1024.0, 1024.0))[: rounds + 4]
+    camera = Camera(size=(2048, 2048), noise_sigma=2.0)
+    frames = [camera.capture(SCENE, pose[None], seed=k)[0, 0] for k, pose in enumerate(path)]
+    tracker = te.Tracker(frames[0], _grid(4, 4, 2048, 2048), 121)
+    body = te.Body(tracker)
+    taken = [_timed(lambda f=frame: body(tracker(f))) for frame in frames[1:]]
+    rate = 1 / statistics.median(taken[2:])
+    console.print(f"2048 x 2048, 16 patches of 121 px with their body: {rate:.0f} frames per second")
+    return [Number("2048^2, 16 patches of 121 px and their body", rate, "1/s", "higher", 0.5)]
+
+
+def _grid(across: int, down: int, width: int, height: int) -> Tensor:
+    x, y = (
+        (torch.arange(n, dtype=torch.float64) + 0.5) * (w - 20) / n + 10 for n, w in ((across, width), (down, height))
+    )
+    return torch.cartesian_prod(y, x).flip(1).round()
+
+
+def _timed(call: Callable[[], object]) -> float:
+    begun = time.perf_counter()
+    call()
+    return time.perf_counter() - begun
+
+
+def steps(dwell_s: float) -> list[Number]:
+    """Figs. 10 and 11: the boxes of a dwell, and the means of dwells minus those of the capacitive sensors."""
+    rows, figures = [], []
+    found = climbed(dwell_s, lambda done, total: None)
+    for name in ("ECC", "body", "CDS"):
+        dwells = found.dwells[name]
+        within = [dwells.errors[dwells.step == k, 2].rad2deg() for k in range(len(dwells.mean))]
+        end, everything = float(torch.stack([box(w) for w in within]).max()), torch.cat(within)
+        cells = [f"{v:.6f}" for v in (end, float(rms(everything)), float(largest(everything)))]
+        off = (found.mean_deg(name) - found.mean_deg("CDS"))[1:]
+        true = _against_truth(found, name)
+        rows.append((name, *cells, f"{float(largest(off)):.6f}", f"{float(largest(true)):.6f}"))
+        figures.append(Number(f"fig10 {name} / end of the largest box", end, "deg", "lower", 0.2))
+        figures.append(Number(f"fig11 {name} / largest absolute error", float(largest(off)), "deg", "lower", 0.2))
+    header = ("", "largest box, deg", "rms", "largest", "Fig. 11: minus CDS", "minus the truth")
+    show(f"Figs. 10 and 11, dwells of {dwell_s:g} s", header, rows)
+    return figures
+
+
+def _against_truth(found, name: str) -> Tensor:
+    """Means (K,) of the steps of theta minus those of what the image really did, deg; NaN for the sensors."""
+    if name == "CDS":
+        return torch.full((len(found.dwells["CDS"].mean) - 1,), math.nan)
+    return (found.mean_deg(name) - found.mean_deg("truth"))[1:]
+
+
+def clockwork(folder: Path) -> list[Number]:
+    """--bodies 3 without masks, at the points that the truth speaks of."""
+    from torch_ecc.commands.track import Session, TrackJob
+
+    facts = json.loads((folder / "truth.json").read_text())
+    out = Path(os.environ.get("TMPDIR", "/tmp")) / "torch-ecc-clockwork"
+    job = TrackJob(input=str(folder / "f*.png"), grid=30, size=21, bodies=3, out=str(out), force=True, overlay=False)
+    session = Session(job)
+    session.run()
+    bodies = json.loads((out / "body.json").read_text())["bodies"]
+    import numpy as np
+
+    with np.load(out / "track.npz") as found:
+        named = {name: torch.from_numpy(found[name]) for name in te.Track._fields if name in found}
+    none = torch.zeros_like(named["score"], dtype=torch.int8)
+    track = te.Track(**(dict.fromkeys(te.Track._fields, none) | named))
+    rows, figures = [], []
+    for fact in bodies:
+        body = te.Body(session.tracker, [fact["patches"]])(track)
+        words, px, deg = _nearest(body, facts)
+        still = float(rms(body.displacement[:, 0, :2].flatten())) if fact["stands_still"] else math.nan
+        rows.append(
+            (str(len(fact["patches"])), "still frame" if fact["stands_still"] else words, px, deg, f"{still:.4f}")
+        )
+    show(
+        "mechanism_video --grid 30 --size 21 --bodies 3",
+        ("patches", "body of the truth", "px rms / max", "deg rms / max", "moved px rms"),
+        rows,
+    )
+    return figures
+
+
+def _nearest(body: te.BodyEstimate, facts: dict) -> tuple[str, str, str]:
+    """The body of the truth that this one is, and the errors there."""
+    best = ("", math.inf, "", "")
+    for name, one in facts["bodies"].items():
+        point = torch.tensor(one["centre_px"], dtype=torch.float64)
+        rows = [[f["bodies"][name][k] for k in ("tx", "ty", "theta_deg")] for f in facts["frames"][-55:]]
+        truth = torch.tensor(rows, dtype=torch.float64) * torch.tensor([1, 1, -math.pi / 180])
+        error = body.at(point)[0][1:, 0] - torch.cat((point, point.new_zeros(1))) - truth
+        px, deg = error[:, :2], error[:, 2].rad2deg()
+        size = float(rms(px.flatten())) + abs(float(rms(deg)))
+        if size < best[1]:
+            words = f"{float(rms(px.flatten())):.3f} / {float(px.abs().max()):.3f}"
+            best = (name, size, words, f"{float(rms(deg)):.3f} / {float(deg.abs().max()):.3f}")
+    return best[0], best[2], best[3]
+
+
+@click.command()
+@click.option("--draws", default=500, show_default=True)
+@click.option(
+    "--only", multiple=True, type=click.Choice(["scatters", "apart", "lenses", "speed", "steps", "clockwork"])
+)
+@click.option("--quick", is_flag=True, help="few draws, short dwells")
+@click.option("--data", type=click.Path(file_okay=False, path_type=Path), help="folder of the real sequences")
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
+def main(draws: int, only: tuple[str, ...], quick: bool, data: Path | None, out: Path | None) -> None:
+    """Print what the README quotes of bodies."""
+    draws = min(draws, 20) if quick else draws
+    sections: dict[str, Callable[[], list[Number]]] = {
+        "scatters": lambda: scatters(draws),
+        "apart": lambda: apart(draws),
+        "lenses": lambda: lenses(6 if quick else 16),
+        "speed": lambda: speed(8 if quick else 40),
+        "steps": lambda: steps(0.3 if quick else 1.0),
+    }
+    if data is not None:
+        sections["clockwork"] = lambda: clockwork(data / "mechanism_video")
+    figures = [figure for name, make in sections.items() if not only or name in only for figure in make()]
+    if out is not None:
+        save(out, figures, draws=str(draws))
+
+
+if __name__ == "__main__":
+    main()
