@@ -81,18 +81,32 @@ def test_two_builds_at_once(compiler, tmp_path):
     assert {path.name.split("-")[0] for path in folder.iterdir()} == set(build.X86)
 
 
+def ended(process: int) -> bool:
+    """Soon, as far as the system tells."""
+    status = Path(f"/proc/{process}/status")
+    for _ in range(100):
+        try:
+            if "zombie" in status.read_text():
+                return True
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        time.sleep(0.1)
+    return False
+
+
 @posix
 def test_a_compiler_that_hangs_is_ended_with_its_children(compiler, tmp_path, monkeypatch):
     compiler("#!/bin/sh\nsleep 1000 &\necho $! >> $0.children\nwait\n")
-    monkeypatch.setattr(build, "SECONDS", 1)
+    monkeypatch.setattr(build, "SECONDS", 3)
     begun = time.monotonic()
-    with pytest.raises(build.BuildError, match=r"compiler did not end within 1 s"):
+    with pytest.raises(build.BuildError, match=r"compiler .* did not end within 3 s"):
         build.build(tmp_path / "there", TARGET)
-    assert time.monotonic() - begun < 20
+    assert time.monotonic() - begun < 100  # of 1000
     assert not list((tmp_path / "there").iterdir())
-    for child in (tmp_path / "compiler.children").read_text().split():
-        status = Path(f"/proc/{child}/status")
-        assert not status.exists() or "zombie" in status.read_text()
+    children = (tmp_path / "compiler.children").read_text().split()
+    assert children
+    for child in children:
+        assert ended(int(child))
 
 
 @posix
