@@ -42,10 +42,8 @@ def call(
     if trust is None:
         results = [torch.empty_like(result) for result in results]  # the fastest way to a tensor
     else:
-        results, some = (
-            [result.new_empty((len(trust.which), *result.shape[1:])) for result in results],
-            _places(trust, results[4]),
-        )
+        some = _places(trust, results[4])
+        results = [result.new_empty((len(trust.which), *result.shape[1:])) for result in results]
     record = CALL.pack(
         *(image.data_ptr(), image.element_size(), height, width, stride[2], stride[0] if many > 1 else 0),
         *(start.data_ptr(), *some),
