@@ -348,6 +348,7 @@ def test_names_that_clash_are_told_apart(tmp_path):
         (["a.npy"], {"centres": [(1, 2)]}, "unknown key 'centres' .did you mean 'centers'"),
         (["a.npy"], {"resume": True}, "unknown key 'resume' .each recording has its own"),
         (["a.npy"], {"workers": 0}, "workers: expected 1 or more, got 0"),
+        (["a.npy"], {"scheduler": "here"}, "scheduler: expected an address as tcp://10.0.0.1:8786, got 'here'"),
         (["a.npy"], {"parts": 2, "stabilise": 0}, "stabilise: not with parts"),
         (["a.npy"], {"match": {"a*": {"sizes": 3}}}, "unknown key 'sizes'"),
         (["a.npy"], {"match": {"a*": {"stabilise": 0}}, "parts": 2}, "stabilise: not with parts"),
