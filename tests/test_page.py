@@ -207,12 +207,12 @@ def test_the_scale_is_a_line_of_known_length(clockwork):
 
 @pytest.fixture
 def gate(monkeypatch):
-    """A run waits at frame 20 until it is opened."""
+    """A run waits at frame 10 until it is opened."""
     opened, watch = threading.Event(), Run._watch
 
     def held(run, frame, estimate):
         watch(run, frame, estimate)
-        if frame.number == 20:
+        if frame.number == 10:
             opened.wait(20)
 
     monkeypatch.setattr(Run, "_watch", held)
@@ -222,16 +222,16 @@ def gate(monkeypatch):
 
 def test_a_run_is_watched_and_a_reload_loses_nothing(clockwork, data, gate, tmp_path):
     page, desk = clockwork.page, clockwork.desk
-    desk.set({"out": str(tmp_path / "page")})
+    desk.set({"out": str(tmp_path / "page"), "frames": "0:29"})
     clockwork.drag((260, 180), (330, 250), (380, 300))
     clockwork.sigma()
     page.click("#track")
-    page.wait_for_selector("#progressed:has-text('21 of 56')")
-    until(page, "document.querySelector('#number').textContent === '20 of 55'")  # the overlay follows
+    page.wait_for_selector("#progressed:has-text('11 of 30')")
+    until(page, "document.querySelector('#number').textContent === '10 of 55'")  # the overlay follows
     other = clockwork.tab()
     page.reload()
     for each in (page, other):
-        each.wait_for_selector("#progressed:has-text('21 of 56')")
+        each.wait_for_selector("#progressed:has-text('11 of 30')")
         assert each.locator("#patches tbody tr").count() == 1
         assert each.is_visible("#curves")
         assert not each.is_visible("#track")
@@ -239,7 +239,7 @@ def test_a_run_is_watched_and_a_reload_loses_nothing(clockwork, data, gate, tmp_
     gate.set()
     for each in (page, other):
         each.wait_for_selector("#files:visible")
-        assert "Tracked 56 frames" in each.inner_text("#words")
+        assert "Tracked 30 frames" in each.inner_text("#words")
     other.close()
     with page.expect_download() as download:
         page.click("#files >> text=track.csv")
@@ -247,14 +247,40 @@ def test_a_run_is_watched_and_a_reload_loses_nothing(clockwork, data, gate, tmp_
     click_a_curve(page)
 
 
+def test_a_run_is_stopped_and_goes_on(clockwork, gate, tmp_path):
+    page, desk = clockwork.page, clockwork.desk
+    desk.set({"out": str(tmp_path / "page"), "overlay": False, "frames": "0:29"})
+    page.click("#track")
+    page.wait_for_selector("#progressed:has-text('11 of 30')")
+    page.click("#stop")
+    page.wait_for_selector("#stop:has-text('Stopping')")
+    gate.set()
+    page.wait_for_selector("#words:has-text('Stopped after 11 frames')")
+    page.click("#resume")
+    page.wait_for_selector("#words:has-text('Tracked 30 frames')")
+    assert desk.rows.rows[:, 0].tolist() == list(range(30))
+    assert not page.is_visible("#resume")
+
+
 def assert_same_track(csv_of_the_page: Path, data: Path, folder: Path) -> None:
     """To 1e-12, as the command line has it."""
-    words = ["track", str(data / "mechanism_video"), "--center", "320", "240", "--size", "121", "--no-overlay"]
+    words = [
+        "track",
+        str(data / "mechanism_video"),
+        "--center",
+        "320",
+        "240",
+        "--size",
+        "121",
+        "--frames",
+        "0:29",
+        "--no-overlay",
+    ]
     done = CliRunner().invoke(cli.app, [*words, "--out", str(folder / "command")])
     assert done.exit_code == 0, done.output
     one, two = (list(csv.reader(path.open())) for path in (csv_of_the_page, folder / "command/track.csv"))
     assert one[0] == two[0]
-    assert len(one) == len(two) == 57
+    assert len(one) == len(two) == 31
     for a, b in zip(one[1:], two[1:], strict=True):
         for left, right in zip(a, b, strict=True):
             try:
@@ -268,7 +294,7 @@ def click_a_curve(page) -> None:
     chart = page.locator(".chart canvas").first
     chart.scroll_into_view_if_needed()
     box = chart.bounding_box()
-    page.mouse.click(box["x"] + 58 + (box["width"] - 66) * 10 / 55, box["y"] + 40)
+    page.mouse.click(box["x"] + 58 + (box["width"] - 66) * 10 / 29, box["y"] + 40)
     page.wait_for_selector("#said:has-text('Frame 10')")
     assert page.inner_text("#number") == "10 of 55"
     assert " ± " in page.inner_text(".chart figcaption >> nth=0")

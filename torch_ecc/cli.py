@@ -129,7 +129,11 @@ def pick(port: int, browser: bool, **options: Any) -> None:
     """
     from torch_ecc.view import serve
 
-    serve(given(options), port, show=lambda url: _show(url, browser))
+    stopped = serve(given(options), port, show=lambda url: _show(url, browser))
+    for line in stopped:
+        console.print(line, soft_wrap=True, markup=False)
+    if stopped:
+        sys.exit(INTERRUPTED)
 
 
 def _show(url: str, browser: bool) -> None:

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def serve(values: Mapping[str, Any], port: int, *, show: Callable[[str], None]) -> None:
-    """Serve the page of a job with these ``values`` until Ctrl-C; ``show`` is told its address. ValueError if what
-    serves pages is not installed."""
+def serve(values: Mapping[str, Any], port: int, *, show: Callable[[str], None]) -> list[str]:
+    """Serve the page of a job with these ``values`` until Ctrl-C; ``show`` is told its address. Sentences about the run
+    that this has stopped, if it has. ValueError if what serves pages is not installed."""
     try:
         from torch_ecc.view.server import Server
     except ModuleNotFoundError as error:
@@ -18,3 +18,5 @@ def serve(values: Mapping[str, Any], port: int, *, show: Callable[[str], None]) 
 
     server = Server(Desk(values), port)
     server.run(ready=lambda: show(server.url))
+    run = server.desk.run
+    return run.words if run is not None and run.state == "stopped" else []

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import Any
@@ -21,6 +22,7 @@ from torch_ecc.view.history import History
 from torch_ecc.view.pictures import jpeg
 
 BUSY, IDLE = 0.04, 0.2  # s between looks at what there is to send
+SHARE = 5.0  # of the time from picture to picture to that of making one: tracking goes before
 Ask = Callable[..., Awaitable[Any]]
 
 
@@ -34,7 +36,7 @@ class Link:
         self.desk, self.socket, self.ask = desk, socket, ask
         self._told: object = None
         self._history: History | None = None
-        self._rows, self._frame, self._shown = 0, -1, True
+        self._rows, self._frame, self._shown, self._rest = 0, -1, True, 0.0
         self._sending = asyncio.Lock()
         self._actions: dict[str, Callable[..., Any]] = {
             name: getattr(desk, name)
@@ -100,11 +102,13 @@ class Link:
 
     async def _send_picture(self) -> None:
         frame = self.desk.run.frame if self.desk.run is not None else None
-        if frame is None or not self._shown or frame.number == self._frame:
+        begun = time.perf_counter()
+        if frame is None or not self._shown or frame.number == self._frame or begun < self._rest:
             return
         self._shown, self._frame = False, frame.number
         row = None if self._history is None else self._history.at(frame.number)
         data = await asyncio.to_thread(jpeg, frame, self.desk.stretch, live=True)
+        self._rest = begun + SHARE * (time.perf_counter() - begun)
         await self._send({"is": "picture", "row": None if row is None else plain(row.tolist())}, data)
 
     async def _send_map(self, answer: dict[str, Any], size: int) -> None:

@@ -9,6 +9,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -82,17 +83,16 @@ class Server:
         self.app = Guard(Starlette(routes=[Mount(f"/{self.token}", routes=routes)]), self.port, self.token)
 
     def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Serve until Ctrl-C; a run that goes on is stopped then, and keeps what it had."""
+        """Serve until Ctrl-C; a run that goes on is stopped then, and keeps what it had: see the desk's ``run``."""
         import uvicorn
 
         config = uvicorn.Config(self.app, log_level="warning", lifespan="off", timeout_graceful_shutdown=1)
         server = uvicorn.Server(config)
         ready()
-        try:
+        with suppress(KeyboardInterrupt):
             server.run(sockets=[self.socket])
-        finally:
-            self.desk.stop()
-            self.worker.shutdown(cancel_futures=True)
+        self.worker.shutdown(cancel_futures=True)
+        self.desk.stop()
 
     async def _ask(self, call: Callable[..., Any], *args: Any, **options: Any) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self.worker, lambda: call(*args, **options))

@@ -4,6 +4,8 @@ import { DEG, ink } from "./words.js";
 
 const WIDTH = 10; // numbers of a template in a row, after the frame's number and its time: see history.py
 const MOST = 20000; // rows that are kept
+const DRAWN = 1600; // rows that are drawn, some two for each px, and those that are doubted
+const OTHERS = 48; // templates that are drawn beside the selected one
 
 export class Curves extends EventTarget {
   rows = [];
@@ -12,6 +14,7 @@ export class Curves extends EventTarget {
   um = null; // (2, 2) px to micrometres
   #charts = [];
   #templates = 0;
+  #shown = []; // the rows that are drawn
 
   constructor(element) {
     super();
@@ -42,6 +45,10 @@ export class Curves extends EventTarget {
   #isDoubted(row) {
     for (let r = 0; r < this.#templates; r++) if (row[11 + WIDTH * r] > 0) return true;
     return false;
+  }
+
+  #isOdd(row) {
+    return this.selected < this.#templates && row[11 + WIDTH * this.selected] > 0;
   }
 
   // The row of a frame, or of the one before it that is nearest.
@@ -79,6 +86,8 @@ export class Curves extends EventTarget {
   draw() {
     this.#pending ??= requestAnimationFrame(() => {
       this.#pending = null;
+      const every = Math.ceil(this.rows.length / DRAWN);
+      this.#shown = every < 2 ? this.rows : this.rows.filter((row, k) => k % every === 0 || k === this.rows.length - 1 || this.#isOdd(row));
       for (const chart of this.#charts) this.#paint(chart);
     });
   }
@@ -103,7 +112,8 @@ export class Curves extends EventTarget {
     context.beginPath();
     context.rect(plot.left, 0, plot.right - plot.left, h);
     context.clip();
-    for (let r = 0; r < this.#templates; r++) if (r !== this.selected) this.#paintCurve(context, title, r, x, y, plot);
+    const others = Math.min(this.#templates, OTHERS);
+    for (let r = 0; r < others; r++) if (r !== this.selected) this.#paintCurve(context, title, r, x, y, plot);
     if (this.selected < this.#templates) this.#paintCurve(context, title, this.selected, x, y, plot);
     context.restore();
     this.#say(chart);
@@ -131,8 +141,9 @@ export class Curves extends EventTarget {
 
   #range(title) {
     let [low, high] = [Infinity, -Infinity];
-    for (const row of this.rows)
+    for (const row of this.#shown)
       for (let r = 0; r < this.#templates; r++) {
+        if (r >= OTHERS && r !== this.selected) continue;
         const [value, sigma] = this.#value(row, r, title);
         if (Number.isNaN(value)) continue;
         const spread = r === this.selected && Number.isFinite(sigma) ? sigma : 0;
@@ -177,7 +188,7 @@ export class Curves extends EventTarget {
     };
     let drawing = false;
     context.fillStyle = css("--bad");
-    for (const row of this.rows) {
+    for (const row of this.#shown) {
       const [value, sigma] = this.#value(row, template, title);
       const at = x(this.#time(row));
       if (row[11 + WIDTH * template] > 0 && template === this.selected) context.fillRect(at - 0.75, plot.bottom - 5, 1.5, 5);
