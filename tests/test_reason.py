@@ -124,10 +124,10 @@ def test_of_equal_places_none_is_taken_and_that_is_why():
 
 
 def test_what_has_slid_away_is_elsewhere():
-    found = Tracker(camera(seen(), 0), [MIDDLE], SIZE)(camera(seen(), 1))
-    home = torch.tensor([[*MIDDLE, 0.0]], dtype=torch.float64)
+    tracker = Tracker(camera(seen(), 0), [MIDDLE], SIZE)
+    past, found = Past.of(dict(tracker.named_buffers())), tracker(camera(seen(), 1))
+    home = past.home
     slid, radius = found._replace(pose=found.pose + torch.tensor([40.0, 0.0, 0.0])), torch.tensor([70.0])
-    past = Past(home, torch.ones(1), torch.zeros(1), found.score, torch.zeros(1), camera(seen(), 0)[None, None], home)
     for estimate, suspects, reason in ((slid, [True], 6), (slid, [False], 0), (found, [True], 0)):
         told = disbelieved(estimate, suspects, home, past, radius)
         assert (told.reason, told.status) == (reason, Status.LOST if reason else Status.CONVERGED)

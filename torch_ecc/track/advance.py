@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.track.budget import BURST
 
 MEMORY = 0.05  # weight of the newest frame in the usual score
@@ -60,6 +60,16 @@ def advanced_in_doubt(state: State, estimate: Estimate, suspects: list[bool]) ->
     state["suspect_frames"].add_(1).mul_(torch.tensor(suspects, device=last.device))
     last.copy_(pose.detach())
     return estimate._replace(pose=pose, displacement=pose - state["start"])
+
+
+def skipped(state: State) -> Estimate:
+    """One frame on, that cannot be looked at: its record (R, ...)."""
+    coast(state, torch.zeros_like(state["since"], dtype=torch.bool))
+    pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
+    codes = (Status.DAMAGED, Origin.TRACKED, Reason.DAMAGED)
+    status, origin, reason = (none.to(torch.int8) + int(code) for code in codes)
+    unknown, moved = torch.diag_embed(torch.full_like(pose, torch.inf)), pose - state["start"]
+    return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone(), reason)
 
 
 def coast(state: State, good: Tensor) -> None:

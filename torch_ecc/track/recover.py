@@ -45,9 +45,10 @@ TOGETHER = 3.0  # px: they have gone the same way, and more than half of those t
 class Past(NamedTuple):
     """What is known of R templates before a frame: last good ``pose`` (R, 3), ``since`` (R,) how many frames, if a
     search has ``found`` it (R,) 0 or 1, ``usual`` score (R,), ``suspect_frames`` (R,) in a row, and the ``first`` frame
-    (1 or R, 1, H, W), where they were at ``home`` (R, 3)."""
+    (1 or R, 1, H, W), where they were at ``home`` (R, 3). ``velocity`` (R, 3): what is expected to be added since."""
 
     pose: Tensor
+    velocity: Tensor
     since: Tensor
     found: Tensor
     usual: Tensor
@@ -58,7 +59,8 @@ class Past(NamedTuple):
     @staticmethod
     def of(state: Mapping[str, Tensor]) -> Past:
         """From a tracker's buffers."""
-        return Past(*(state[name] for name in ("pose", "since", "found", "score", "suspect_frames", "first", "start")))
+        names = ("pose", "velocity", "since", "found", "score", "suspect_frames", "first", "start")
+        return Past(*(state[name] for name in names))
 
 
 def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
@@ -86,6 +88,18 @@ def disbelieved(estimate: Estimate, suspects: list[bool], start: Tensor, past: P
     slid = (estimate.origin == Origin.TRACKED) & strayed(estimate, start, past, radius, SLID)
     lost = torch.tensor(suspects, device=start.device) & slid & Status.good(estimate.status)
     return disproved(estimate, lost, Reason.ELSEWHERE)
+
+
+def from_rest(reference: Reference, image: Tensor, estimate: Estimate, past: Past, settings: Settings) -> Estimate:
+    """The ``estimate`` of an ``image`` (1 or R, 1, H, W) in which those that are lost, and were expected to go on, have
+    been tried where they were last: nobody knows if they have."""
+    index = (~Status.good(estimate.status) & (past.velocity != 0).any(1) & (past.since > 1)).nonzero()[:, 0]
+    if len(index) == 0:
+        return estimate
+    view = image if len(image) == 1 else image[index]
+    found = solve(reference.select(index), view, past.pose[index], settings, past.home[index], past.usual[index])
+    good = Status.good(found.status)
+    return estimate.put(index[good], found.at(good))
 
 
 def disproved(estimate: Estimate, lost: Tensor, reason: Reason) -> Estimate:
@@ -149,6 +163,7 @@ class Recovery:
         if not due or not self.budget.left():
             return told(estimate, due, Reason.WAITING)
         images[:] = self.unmarked(images)
+        start = torch.where((past.since % 2 == 0)[:, None], past.pose, start)  # by turns, as if it had gone on, or not
         found = self.search_near(images[0], estimate, start, past, sorted(due))
         estimate = self.follow(images[0], self.own(found, estimate, start, past), start, past.usual)
         suspects = suspect(estimate, past.usual)

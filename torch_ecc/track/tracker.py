@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion, named
-from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
+from torch_ecc.core.estimate import Estimate, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
 from torch_ecc.core.pose import ahead
@@ -25,12 +25,12 @@ from torch_ecc.core.sight import as_frame_mask, filled, seen_through
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
-from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, coast
+from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, skipped
 from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, told
 from torch_ecc.track.max_step import MaxStep
-from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, suspect
+from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
@@ -288,9 +288,10 @@ class Tracker(nn.Module):
         images = [image.detach()]
         state["credit"].add_(self.income)
         estimate = self._within_reach(self._solve(image, images, start))
-        doubtful = any(suspect(estimate, state["score"]))
+        doubtful, past = any(suspect(estimate, state["score"])), Past.of(state)
+        if doubtful:
+            estimate = self._within_reach(from_rest(self.references[0], images[0], estimate, past, self.settings))
         if doubtful and self.search:
-            past = Past.of(state)
             estimate = self._within_reach(self._recovery(images, estimate, start, past))
             suspects = suspect(estimate, state["score"])
             estimate = disbelieved(estimate, suspects, start, past, self.references[0].place.radius)
@@ -315,13 +316,7 @@ class Tracker(nn.Module):
     @torch.no_grad()
     def skip(self) -> Estimate:
         """The record (R, ...) of a frame that cannot be looked at: the last good poses, and Status.DAMAGED."""
-        state: Any = self._buffers
-        coast(state, torch.zeros_like(state["since"], dtype=torch.bool))
-        pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
-        codes = (Status.DAMAGED, Origin.TRACKED, Reason.DAMAGED)
-        status, origin, reason = (none.to(torch.int8) + int(code) for code in codes)
-        unknown, moved = torch.diag_embed(torch.full_like(pose, torch.inf)), pose - state["start"]
-        return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone(), reason)
+        return skipped(self._buffers)
 
     @torch.no_grad()
     def expect(self, pose: Tensor, step: Tensor, which: Tensor) -> None:
