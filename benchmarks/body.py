@@ -17,11 +17,12 @@ from pathlib import Path
 
 import click
 import cv2
+import numpy as np
 import torch
 from results import save
 from rich.console import Console
 from rich.table import Table
-from rigid import Drawn, Near, Plan, draw
+from rigid import SCENE, Drawn, Near, Plan, draw
 from rivals import rivals
 from scaling import slope
 from staircase import climbed
@@ -32,8 +33,9 @@ from torch_ecc.core.pose import compose, inverse, transform
 from torch_ecc.paper.bound import cramer_rao, rounding
 from torch_ecc.paper.errors import box, largest, rms
 from torch_ecc.paper.result import Number
-from torch_ecc.sim import Camera, PlaneWaves, harmonic, placed
+from torch_ecc.sim import Camera, harmonic, placed
 
+SECTIONS = ("scatters", "apart", "lenses", "speed", "steps", "clockwork")
 APART = (0, 1, 5, 10, 15)
 UM_PER_PX = 0.55  # of the paper's camera at 10 x
 console = Console(width=150)
@@ -73,9 +75,6 @@ def scatters(draws: int) -> list[Number]:
     return figures
 
 
-SCENE = PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0)
-
-
 def apart(draws: int) -> list[Number]:
     rows, figures = [], []
     plan = Plan()
@@ -111,20 +110,12 @@ def lenses(frames: int) -> list[Number]:
     for name, one in (("none", None), ("self-calibrated", fit.lens), ("known", lens)):
         error, residual = _behind(te.Body(tracker, lens=one), te.Body(tracker, lens=lens), track, path, plan)
         px = float(rms(error[:, :2].flatten()))
-        rows.append(
-            (
-                name,
-                f"{px:.5f}",
-                f"{1e3 * UM_PER_PX * px:.2f}",
-                f"{1e6 * float(rms(error[:, 2])):.2f}",
-                f"{residual:.5f}",
-            )
-        )
+        told = (1e3 * UM_PER_PX * px, 1e6 * float(rms(error[:, 2])))
+        rows.append((name, f"{px:.5f}", *(f"{v:.2f}" for v in told), f"{residual:.5f}"))
         figures.append(Number(f"lens of 0.5 %, {name} / body", px, "px", "lower", 0.1))
         figures.append(Number(f"lens of 0.5 %, {name} / patches", residual, "px", "lower", 0.1))
-    show(
-        f"A lens of 0.5 %, {frames} frames: {fit}", ("lens", "body px rms", "nm", "theta urad", "patches px rms"), rows
-    )
+    header = ("lens", "body px rms", "nm", "theta urad", "patches px rms")
+    show(f"A lens of 0.5 %, {frames} frames: {fit}", header, rows)
     line = plan.middle + torch.linspace(-170, 170, 6, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0])
     for words, moves, commanded in (("one direction", line, True), ("no move", line[:1].expand(6, 3), False)):
         tracker, track = _followed(plan, lens, moves)
@@ -161,16 +152,7 @@ def speed(rounds: int) -> list[Number]:
     frames = list(Camera(noise_sigma=2.0).capture(SCENE, path)[:, 0])
     for across, down in ((4, 4), (8, 4), (8, 8)):
         centers = _grid(across, down, 640, 480)
-        trackers = [te.Tracker(frames[0], centers, 51) for _ in range(2)]
-        body = te.Body(trackers[0])
-        both, alone, theirs = [], [], []
-        peers = [rivals()["OpenCV ECC, fastest fair"].start(frames[0], (x, y), 51) for x, y in centers.tolist()]
-        for k, frame in enumerate(frames[1:]):
-            both.append(_timed(lambda f=frame: body(trackers[0](f))))
-            alone.append(_timed(lambda f=frame: trackers[1](f)))
-            if k % 4 == 0:
-                theirs.append(_timed(lambda f=frame: [one(f) for one in peers]))
-        a, b, c = (1 / statistics.median(v[2:] or v) for v in (both, alone, theirs))
+        a, b, c = _rates(frames, centers)
         taken[len(centers)] = 1 / a
         rows.append((str(len(centers)), f"{a:.0f}", f"{b:.0f}", f"{1e3 / a - 1e3 / b:.2f}", f"{c:.1f}", f"{a / c:.1f}"))
         figures.append(Number(f"{len(centers)} patches and their body / over OpenCV's", a / c, "x", "higher", 0.5))
@@ -180,28 +162,47 @@ def speed(rounds: int) -> list[Number]:
     return figures + _large(rounds)
 
 
+def _rates(frames: list[Tensor], centers: Tensor) -> tuple[float, float, float]:
+    """Frames per second, medians, of the patches with their body, without, and of OpenCV's ECC in a loop; in turns."""
+    with_body, without = (te.Tracker(frames[0], centers, 51) for _ in range(2))
+    body = te.Body(with_body)
+    peers = [rivals()["OpenCV ECC, fastest fair"].start(frames[0], (x, y), 51) for x, y in centers.tolist()]
+    calls: tuple[Callable[[Tensor], object], ...] = (
+        lambda frame: body(with_body(frame)),
+        without,
+        lambda frame: [one(frame) for one in peers],
+    )
+    taken: list[list[float]] = [[], [], []]
+    for frame in frames[1:]:
+        for call, times in zip(calls, taken, strict=True):
+            times.append(_timed(call, frame))
+    a, b, c = (1 / statistics.median(times[2:]) for times in taken)
+    return a, b, c
+
+
 def _large(rounds: int) -> list[Number]:
+    """The paper's whole camera."""
     path = placed(harmonic((6.0, 6.0, 0.005), 30), (1024.0, 1024.0))[: rounds + 4]
     camera = Camera(size=(2048, 2048), noise_sigma=2.0)
     frames = [camera.capture(SCENE, pose[None], seed=k)[0, 0] for k, pose in enumerate(path)]
     tracker = te.Tracker(frames[0], _grid(4, 4, 2048, 2048), 121)
     body = te.Body(tracker)
-    taken = [_timed(lambda f=frame: body(tracker(f))) for frame in frames[1:]]
+    taken = [_timed(lambda frame: body(tracker(frame)), frame) for frame in frames[1:]]
     rate = 1 / statistics.median(taken[2:])
     console.print(f"2048 x 2048, 16 patches of 121 px with their body: {rate:.0f} frames per second")
     return [Number("2048^2, 16 patches of 121 px and their body", rate, "1/s", "higher", 0.5)]
 
 
 def _grid(across: int, down: int, width: int, height: int) -> Tensor:
-    x, y = (
-        (torch.arange(n, dtype=torch.float64) + 0.5) * (w - 20) / n + 10 for n, w in ((across, width), (down, height))
-    )
+    """Centres of as many equal fields, 10 px from the border."""
+    sides = (across, width - 20), (down, height - 20)
+    x, y = (10 + (torch.arange(n, dtype=torch.float64) + 0.5) * w / n for n, w in sides)
     return torch.cartesian_prod(y, x).flip(1).round()
 
 
-def _timed(call: Callable[[], object]) -> float:
+def _timed(call: Callable[[Tensor], object], frame: Tensor) -> float:
     begun = time.perf_counter()
-    call()
+    call(frame)
     return time.perf_counter() - begun
 
 
@@ -241,8 +242,6 @@ def clockwork(folder: Path) -> list[Number]:
     session = Session(job)
     session.run()
     bodies = json.loads((out / "body.json").read_text())["bodies"]
-    import numpy as np
-
     with np.load(out / "track.npz") as found:
         named = {name: torch.from_numpy(found[name]) for name in te.Track._fields if name in found}
     none = torch.zeros_like(named["score"], dtype=torch.int8)
@@ -252,14 +251,10 @@ def clockwork(folder: Path) -> list[Number]:
         body = te.Body(session.tracker, [fact["patches"]])(track)
         words, px, deg = _nearest(body, facts)
         still = float(rms(body.displacement[:, 0, :2].flatten())) if fact["stands_still"] else math.nan
-        rows.append(
-            (str(len(fact["patches"])), "still frame" if fact["stands_still"] else words, px, deg, f"{still:.4f}")
-        )
-    show(
-        "mechanism_video --grid 30 --size 21 --bodies 3",
-        ("patches", "body of the truth", "px rms / max", "deg rms / max", "moved px rms"),
-        rows,
-    )
+        words = "still frame" if fact["stands_still"] else words
+        rows.append((str(len(fact["patches"])), words, px, deg, f"{still:.4f}"))
+    header = ("patches", "body of the truth", "px rms / max", "deg rms / max", "moved px rms")
+    show("mechanism_video --grid 30 --size 21 --bodies 3", header, rows)
     return figures
 
 
@@ -281,9 +276,7 @@ def _nearest(body: te.BodyEstimate, facts: dict) -> tuple[str, str, str]:
 
 @click.command()
 @click.option("--draws", default=500, show_default=True)
-@click.option(
-    "--only", multiple=True, type=click.Choice(["scatters", "apart", "lenses", "speed", "steps", "clockwork"])
-)
+@click.option("--only", multiple=True, type=click.Choice(SECTIONS))
 @click.option("--quick", is_flag=True, help="few draws, short dwells")
 @click.option("--data", type=click.Path(file_okay=False, path_type=Path), help="folder of the real sequences")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")

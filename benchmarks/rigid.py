@@ -16,6 +16,7 @@ from torch_ecc.paper.scheme import Kept
 from torch_ecc.sim import Camera, PlaneWaves
 
 SCENE = PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0)
+FEW = PlaneWaves.random(count=50, fmax=0.25, rms_gradient=7.0)  # waves, where each pixel's value is computed alone
 OTHER = PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0, seed=3)
 OFF = torch.tensor([0.3, -0.3, 0.003], dtype=torch.float64)  # of where patches are looked for
 REDRAWN = 25  # draws of the noise on one pair of poses
@@ -117,7 +118,7 @@ def _jumped(estimate: Estimate, apart: tuple[int, ...]) -> Estimate:
 
 
 class Near(NamedTuple):
-    """SCENE as a ``lens`` shows it, drawn only near patches at ``places`` (R, 2) of the scene: exact, and quick."""
+    """FEW as a ``lens`` shows it, drawn only near patches at ``places`` (R, 2) of the scene: exact, and quick."""
 
     lens: Lens
     places: Tensor
@@ -125,12 +126,12 @@ class Near(NamedTuple):
 
     def render(self, poses: Tensor, size: tuple[int, int]) -> Tensor:
         """Frames (B, 1, h, w) at poses (B, 3)."""
-        frames = torch.full((len(poses), 1, *size), SCENE.mean)
+        frames = torch.full((len(poses), 1, *size), FEW.mean)
         side = torch.arange(-self.reach, self.reach + 1, dtype=torch.float64)
         box = torch.cartesian_prod(side, side)
         for frame, pose in zip(frames[:, 0], poses.double(), strict=True):
             at = (self.lens.distort(transform(pose, self.places)).round()[:, None] + box).flatten(0, 1)
             at = at[((at >= 0) & (at < at.new_tensor((size[1], size[0])))).all(1)]
             looks = transform(inverse(pose), self.lens.undistort(at))
-            frame[at[:, 1].long(), at[:, 0].long()] = SCENE.value(looks).float()
+            frame[at[:, 1].long(), at[:, 0].long()] = FEW.value(looks).float()
         return frames
