@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion
+from torch_ecc.core.dead_lines import DeadLines, dead_lines
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
 from torch_ecc.core.patches import Centers, Crop, Size, crop, locate_patches, unmarked
@@ -113,6 +114,8 @@ class Tracker(nn.Module):
         self.max_step = MaxStep.of(max_step)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape, self.levels = tuple(gray.shape), levels
+        self.dead = _dead_lines("Tracker", gray)
+        gray = gray if self.dead is None else self.dead.repair(gray)
         self.frame_mask = _frame_mask("Tracker", frame_mask, gray)
         patches = unmarked("Tracker", locate_patches("Tracker", gray, centers, size, mask), self.frame_mask)
         _check_levels(levels, patches.size)
@@ -140,6 +143,8 @@ class Tracker(nn.Module):
         h, w = gray.shape[-2:]
         tracker = cls(gray, [((w - 1) / 2, (h - 1) / 2)] * len(gray), (h, w), **options)
         view = as_gray("find", "frame", frame, tracker.pose.device)
+        tracker.dead = _dead_lines("find", view)
+        view = view if tracker.dead is None else tracker.dead.repair(view)
         tracker.frame_mask, tracker.frame_shape = _frame_mask("find", frame_mask, view), tuple(view.shape)
         tracker._use(tracker.references)
         settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
@@ -179,6 +184,7 @@ class Tracker(nn.Module):
         device = fn(self.score).device
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
         self.frame_mask = None if self.frame_mask is None else self.frame_mask.to(device)
+        self.dead = None if self.dead is None else DeadLines(*(lines.to(device) for lines in self.dead))
         self._use([reference.map(lambda tensor: tensor.to(device)) for reference in self.references])
         return self
 
@@ -240,6 +246,7 @@ class Tracker(nn.Module):
         image = as_image("track", "frame", frame, state["pose"].device)
         if image.shape != self.frame_shape:
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
+        image = image if self.dead is None else self.dead.repair(image)
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image]
         estimate = self._within_reach(self._solve(images, start))
@@ -336,6 +343,15 @@ def _kept(frame: Tensor) -> Tensor:
 def _frame_mask(where: str, mask: Tensor | None, frame: Tensor) -> Tensor | None:
     """Where a camera whose ``frame`` (1 or R, 1, H, W) that is shows the scene, None for everywhere."""
     return None if mask is None else as_frame_mask(where, mask, (frame.shape[2], frame.shape[3])).to(frame.device)
+
+
+def _dead_lines(where: str, frame: Tensor) -> DeadLines | None:
+    """Those of a camera whose ``frame`` (1 or R, 1, H, W) that is, with a warning."""
+    dead = dead_lines(frame)
+    if dead is not None:
+        told = f"{len(dead.rows)} rows and {len(dead.columns)} columns of the frame are dead"
+        warnings.warn(f"{where}: {told}: what lies beside them is put there, in all frames", stacklevel=6)
+    return dead
 
 
 def _warn_of_textureless(each: list[bool]) -> None:
