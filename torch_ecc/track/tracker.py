@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion, named
+from torch_ecc.core.dead_lines import DeadLines
 from torch_ecc.core.estimate import Estimate, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
@@ -21,7 +22,7 @@ from torch_ecc.core.pose import ahead
 from torch_ecc.core.pyramid import check_levels, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.sight import as_frame_mask, filled, seen_through
+from torch_ecc.core.sight import filled, seen_through
 from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
@@ -31,6 +32,7 @@ from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, told
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
+from torch_ecc.track.sensor import dead_in, shown
 
 PREDICTIONS = ("hold", "velocity")
 COARSE_TOLERANCE = 0.1  # px of a coarse level
@@ -125,7 +127,9 @@ class Tracker(nn.Module):
         self.max_step, self.income = MaxStep.of(max_step), income(search_share)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape, self.levels = tuple(gray.shape), levels
-        self.frame_mask = _frame_mask("Tracker", frame_mask, gray)
+        self.dead = dead_in("Tracker", gray)
+        gray = gray if self.dead is None else self.dead.repair(gray)
+        self.frame_mask = shown("Tracker", frame_mask, gray)
         patches = unmarked("Tracker", locate_patches("Tracker", gray, centers, size, mask), self.frame_mask)
         check_levels(levels, patches.size)
         self._begin(gray, patches)
@@ -160,7 +164,9 @@ class Tracker(nn.Module):
         h, w = gray.shape[-2:]
         tracker = cls(gray, [((w - 1) / 2, (h - 1) / 2)] * len(gray), (h, w), **options)
         view = as_gray("find", "frame", frame, tracker.pose.device)
-        tracker.frame_mask, tracker.frame_shape = _frame_mask("find", frame_mask, view), tuple(view.shape)
+        tracker.dead = dead_in("find", view)
+        view = view if tracker.dead is None else tracker.dead.repair(view)
+        tracker.frame_mask, tracker.frame_shape = shown("find", frame_mask, view), tuple(view.shape)
         tracker._use(tracker.references)
         settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
@@ -219,6 +225,7 @@ class Tracker(nn.Module):
         device = fn(self.score).device
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
         self.frame_mask = None if self.frame_mask is None else self.frame_mask.to(device)
+        self.dead = None if self.dead is None else DeadLines(*(lines.to(device) for lines in self.dead))
         self._use([reference.map(lambda tensor: tensor.to(device)) for reference in self.references])
         return self
 
@@ -284,6 +291,7 @@ class Tracker(nn.Module):
             raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
         if self.learns and self.template._version != self._version:  # by another handle of the same state
             self._use(self._prepared(self._buffers))
+        image = image if self.dead is None else self.dead.repair(image)
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image.detach()]
         state["credit"].add_(self.income)
@@ -372,11 +380,6 @@ def _kept(frame: Tensor) -> Tensor:
     """A frame (1 or R, 1, H, W) in half the memory, good enough to look for look-alikes in: float16 about its mean."""
     gray = frame - frame.mean((2, 3), keepdim=True)
     return (gray / gray.square().mean((2, 3), keepdim=True).sqrt().clamp(min=1e-30)).clamp(-1e4, 1e4).half()
-
-
-def _frame_mask(where: str, mask: Tensor | None, frame: Tensor) -> Tensor | None:
-    """Where a camera whose ``frame`` (1 or R, 1, H, W) that is shows the scene, None for everywhere."""
-    return None if mask is None else as_frame_mask(where, mask, (frame.shape[2], frame.shape[3])).to(frame.device)
 
 
 def _warn_of_textureless(each: list[bool]) -> None:

@@ -1,0 +1,24 @@
+"""What in a frame is the camera's own, not the scene's: marks that a mask tells of, and dead lines."""
+
+from __future__ import annotations
+
+import warnings
+
+from torch import Tensor
+
+from torch_ecc.core.dead_lines import DeadLines, dead_lines
+from torch_ecc.core.sight import as_frame_mask
+
+
+def shown(where: str, mask: Tensor | None, frame: Tensor) -> Tensor | None:
+    """Where a camera whose ``frame`` (1 or R, 1, H, W) that is shows the scene, None for everywhere."""
+    return None if mask is None else as_frame_mask(where, mask, (frame.shape[2], frame.shape[3])).to(frame.device)
+
+
+def dead_in(where: str, frame: Tensor) -> DeadLines | None:
+    """The dead lines of a camera whose ``frame`` (1 or R, 1, H, W) that is, with a warning."""
+    dead = dead_lines(frame)
+    if dead is not None:
+        told = f"{len(dead.rows)} rows and {len(dead.columns)} columns of the frame are dead"
+        warnings.warn(f"{where}: {told}: what lies beside them is put there, in all frames", stacklevel=6)
+    return dead
