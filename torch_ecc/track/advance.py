@@ -7,13 +7,20 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.track.budget import BURST
 
+PREDICTIONS = ("hold", "velocity")
 MEMORY = 0.05  # weight of the newest frame in the usual score
 KEPT = 16  # frames for which a template that is not found is expected to go on as before
 
 State = Mapping[str, Tensor]  # a tracker's buffers: see there
+
+
+def check_prediction(prediction: str) -> None:
+    """ValueError for one that is not known."""
+    if prediction not in PREDICTIONS:
+        raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
 
 
 def beginning(start: Tensor) -> dict[str, Tensor]:
@@ -69,3 +76,13 @@ def coast(state: State, good: Tensor) -> None:
     longer = torch.where(since < KEPT, (since + 1) / since, 0.0)
     state["velocity"].mul_(torch.where(good, 1.0, longer).unsqueeze(1))
     since.add_(1).masked_fill_(good, 1)
+
+
+def unseen(state: State) -> Estimate:
+    """One frame on that cannot be looked at: the last good poses, and Status.DAMAGED."""
+    coast(state, torch.zeros_like(state["since"], dtype=torch.bool))
+    pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
+    codes = (Status.DAMAGED, Origin.TRACKED, Reason.DAMAGED)
+    status, origin, reason = (none.to(torch.int8) + int(code) for code in codes)
+    unknown, moved = torch.diag_embed(torch.full_like(pose, torch.inf)), pose - state["start"]
+    return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone(), reason)

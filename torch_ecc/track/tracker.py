@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion, named
-from torch_ecc.core.estimate import Estimate, Origin, Reason, Status, Track
+from torch_ecc.core.estimate import Estimate, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
 from torch_ecc.core.pose import ahead
@@ -22,18 +22,17 @@ from torch_ecc.core.pyramid import check_levels, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import as_frame_mask, filled, seen_through
-from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
-from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
-from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, coast
+from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, image_pyramid
+from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, unseen
 from torch_ecc.track.budget import Budget, income
+from torch_ecc.track.coarse import coarse_to_fine
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, told
+from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, teaches, told
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, suspect
+from torch_ecc.track.shutter import Shutter
 
-PREDICTIONS = ("hold", "velocity")
-COARSE_TOLERANCE = 0.1  # px of a coarse level
 DERIVED = ("references", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
 
 
@@ -67,7 +66,9 @@ class Tracker(nn.Module):
     many frames, the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last so
     many frames, again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up,
     and sigma tells what the anchor is still worth. Nothing is learned from frames that are not CONVERGED or are
-    covered, nor where something is suddenly another.
+    covered, nor where something is suddenly another. ``line_time``: seconds from the exposure of one row to the next,
+    of a camera with a rolling shutter that takes ``fps`` frames per second: poses are those of the instant at which the
+    row of the template's centre is exposed (``track.shutter``); in the first frame it is at rest.
 
     What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
     with its own options. A state comes whole or not at all; what does not fit is refused before anything is changed.
@@ -116,15 +117,22 @@ class Tracker(nn.Module):
         backend: str = "auto",
         average: int = 1,
         renew: int | None = None,
+        line_time: float | None = None,
+        fps: float | None = None,
     ) -> None:
         super().__init__()
-        _check_prediction(prediction)
-        self.rounds = as_rounds(average, renew)  # frames that the first lesson takes, and each later one
+        check_prediction(prediction)
+        self.rounds, self.shutter = as_rounds(average, renew), Shutter.of(line_time, fps)
         self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, robust, backend)
         self.prediction, self.search, self.criterion = prediction, search, make_criterion(criterion, illumination)
-        self.max_step, self.income = MaxStep.of(max_step), income(search_share)
+        self.max_step, self.income, self.shutter = (
+            MaxStep.of(max_step),
+            income(search_share),
+            Shutter.of(line_time, fps),
+        )
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape, self.levels = tuple(gray.shape), levels
+        self.shutter.check(gray.shape[2])
         self.frame_mask = _frame_mask("Tracker", frame_mask, gray)
         patches = unmarked("Tracker", locate_patches("Tracker", gray, centers, size, mask), self.frame_mask)
         check_levels(levels, patches.size)
@@ -134,7 +142,8 @@ class Tracker(nn.Module):
         """The state before the first frame that is tracked."""
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
         first = _kept(filled(gray, self.frame_mask))  # frame: what else in it looks like them?
-        for name, value in {**templates._asdict(), "first": first, **beginning(start)}.items():
+        past = self.shutter.beginning(start)
+        for name, value in {**templates._asdict(), "first": first, **beginning(start), **past}.items():
             self.register_buffer(name, value)
         self._use(self._prepared(self._buffers))
         self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
@@ -196,11 +205,15 @@ class Tracker(nn.Module):
 
     def _learned(self, image: Tensor, estimate: Estimate, suspects: list[bool]) -> Estimate:
         """The ``estimate`` of an ``image``, from which the templates have learned."""
+        state = self._buffers
         if self.learns:
+            distortion = self.shutter.distortion(estimate.pose, state)
+            warp = self.references[0].distorted(distortion).warps(estimate.pose)
             with torch.no_grad():
-                new = self._teacher(image, estimate, suspects, self._buffers)
+                new = self._teacher(image, warp, teaches(estimate, suspects), state)
                 if len(new) > 0:
-                    self._use(renewed(self.references, new, self._buffers, self._prepared))
+                    self._use(renewed(self.references, new, state, self._prepared))
+        self.shutter.remember(state, estimate)
         return estimate
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -315,13 +328,8 @@ class Tracker(nn.Module):
     @torch.no_grad()
     def skip(self) -> Estimate:
         """The record (R, ...) of a frame that cannot be looked at: the last good poses, and Status.DAMAGED."""
-        state: Any = self._buffers
-        coast(state, torch.zeros_like(state["since"], dtype=torch.bool))
-        pose, none = state["pose"].clone(), torch.zeros_like(state["pose"][:, 0])
-        codes = (Status.DAMAGED, Origin.TRACKED, Reason.DAMAGED)
-        status, origin, reason = (none.to(torch.int8) + int(code) for code in codes)
-        unknown, moved = torch.diag_embed(torch.full_like(pose, torch.inf)), pose - state["start"]
-        return Estimate(pose, moved, none, status, none.long(), unknown, none.clone(), origin, none.clone(), reason)
+        self.shutter.wait(self._buffers)
+        return unseen(self._buffers)
 
     @torch.no_grad()
     def expect(self, pose: Tensor, step: Tensor, which: Tensor) -> None:
@@ -355,22 +363,17 @@ class Tracker(nn.Module):
         return Track.stack(estimates)
 
     def _solve(self, image: Tensor, images: list[Tensor], pose: Tensor) -> Estimate:
-        """Coarse to fine; ``images`` holds the ``image`` without gradients and grows to as many levels as there are.
-        What a level has found is kept only if it looks better to the next finer one than its start: fine texture is not
-        there in a coarse level, which then leads anywhere."""
+        """Coarse to fine; ``images`` holds the ``image`` without gradients and grows to as many levels as there are."""
         if self.levels > 1:
             image = filled(image.float(), self.frame_mask)
             images[:] = image_pyramid(image.detach(), self.levels)
-        most = self.settings.max_iterations
-        for level in range(self.levels - 1, 0, -1):
-            scale, double = (pose.new_tensor((s, s, 1.0)) for s in (2.0**level, 2.0))
-            state, *_ = iterate(
-                self.references[level], images[level], "bilinear", State.start(pose / scale), COARSE_TOLERANCE, most
-            )
-            finer = self.references[level - 1], images[level - 1]
-            better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
-            pose = torch.where(better[:, None], state.pose * scale, pose)
-        return solve(self.references[0], image, pose, self.settings, self._buffers["start"], self._buffers["score"])
+            pose = coarse_to_fine(self.references, images, pose, self.settings.max_iterations)
+        start, usual = self._buffers["start"], self._buffers["score"]
+
+        def look(reference: Reference, there: Tensor) -> Estimate:
+            return solve(reference, image, there, self.settings, start, usual)
+
+        return self.shutter.solve(look, self.references[0], pose, self._buffers, self.settings.tolerance)
 
 
 def _kept(frame: Tensor) -> Tensor:
@@ -389,11 +392,6 @@ def _warn_of_textureless(each: list[bool]) -> None:
     if which:
         names = f"template {which[0]}" if len(which) == 1 else f"templates {', '.join(map(str, which))}"
         warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=7)
-
-
-def _check_prediction(prediction: str) -> None:
-    if prediction not in PREDICTIONS:
-        raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
 
 
 def _words(shape: tuple[int, ...]) -> str:
