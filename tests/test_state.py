@@ -32,6 +32,7 @@ KINDS = {
     "ssd": {"criterion": "ssd"},
     "average": {"average": 3},
     "renew": {"renew": 2},
+    "shutter": {"line_time": 2e-4, "fps": 50.0},
 }
 
 

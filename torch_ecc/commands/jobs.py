@@ -12,9 +12,9 @@ from typing import Any
 from torch_ecc.core.criteria import CRITERIA, ILLUMINATION
 from torch_ecc.core.settings import Settings, described
 from torch_ecc.records.calibration import Calibration
+from torch_ecc.track.advance import PREDICTIONS
 from torch_ecc.track.budget import income
 from torch_ecc.track.max_step import MaxStep
-from torch_ecc.track.tracker import PREDICTIONS
 
 Point = tuple[float, float]
 SIGNS = ("auto", *map("".join, product("+-", repeat=3)))  # of x, y and theta
@@ -39,6 +39,10 @@ class Tracking(Settings):
     average: int = described(1, "the templates become the mean of so many frames: less noise in dim pictures")
     renew: int | None = described(
         None, "they become the mean of the last so many frames, again and again: surfaces that change", example=20
+    )
+
+    line_time: float | None = described(
+        None, "s from one row to the next of a rolling shutter; a pose is of when its own row is exposed", example=1e-5
     )
 
     def __post_init__(self) -> None:
@@ -136,6 +140,14 @@ class TrackJob(Tracking):
             return None
         x, y = Calibration(scale).scales
         return Calibration((x, -y if self.flip_y else y), math.radians(self.axis_angle_deg))
+
+    def rate(self, fps: float | None) -> dict[str, float]:
+        """That of the frames that are tracked, of an input with ``fps``, if it matters. ValueError if nobody knows."""
+        if self.line_time is None:
+            return {}
+        if fps is None:
+            raise ValueError("line_time: expected with fps, which the input does not tell")
+        return {"fps": fps / (span(self.frames).step or 1)}
 
     def folder(self) -> Path:
         """Where the results go."""

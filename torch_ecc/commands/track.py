@@ -104,7 +104,7 @@ class Session:
         centers, size, mask = self.templates
         if job.stabilise is not None and not 0 <= job.stabilise < len(centers):
             raise ValueError(f"stabilise: expected a template from 0 to {len(centers) - 1}, got {job.stabilise}")
-        options = job.options() | {"frame_mask": read_frame_mask(job)}
+        options = job.options() | {"frame_mask": read_frame_mask(job), **job.rate(self.source.fps)}
         with threads_for(len(centers) * size[0] * size[1]):
             if crops is None:
                 self.tracker = Tracker(first, centers, size, mask=mask, **options)

@@ -14,18 +14,25 @@ from torch_ecc.core.solution import Trust
 
 DTYPES = (torch.uint8, torch.uint16, torch.float32)  # of images
 FIELDS = ("pose", "error", "iterations", "gain", "sums", "total", "moments")  # of answers
-CALL = Struct("@20qdq")  # Call
+CALL = Struct("@21qdq")  # Call
 PIXELS_PER_THREAD = 2**19  # some 2 ms of work
 
 How = tuple[int, int, float, int]  # degree of the spline between pixels, max_iterations, tolerance, criterion
 
 
 def call(
-    library: Library, image: Tensor, start: Tensor, packed: Packed, how: How, trust: Trust | None = None
+    library: Library,
+    image: Tensor,
+    start: Tensor,
+    packed: Packed,
+    how: How,
+    trust: Trust | None = None,
+    distortion: Tensor | None = None,
 ) -> tuple[int, list[Tensor]]:
     """Of the packed templates in (B or 1, 1, H, W) from ``start`` (B, 3), float64, on, or of those that ``trust`` is
-    about: how many are partial, because not all of their pixels count; and ``FIELDS``, see ``solution.Solution``.
-    ``moments`` (n, MOMENTS) make the normal equations of those that are partial; of others the first is -1.
+    about, seen with a ``distortion`` (B, 2, 2), float64: how many are partial, because not all of their pixels count;
+    and ``FIELDS``, see ``solution.Solution``. ``moments`` (n, MOMENTS) make the normal equations of those that are
+    partial; of others the first is -1.
 
     Raises ValueError, MemoryError.
     """
@@ -46,7 +53,7 @@ def call(
         results = [result.new_empty((len(trust.which), *result.shape[1:])) for result in results]
     record = CALL.pack(
         *(image.data_ptr(), image.element_size(), height, width, stride[2], stride[0] if many > 1 else 0),
-        *(start.data_ptr(), *some),
+        *(start.data_ptr(), *some, _bent(distortion, len(start))),
         *[result.data_ptr() for result in results],
         *(len(results[0]), _threads(len(results[0]) * packed.pixels), *how),
     )
@@ -60,6 +67,15 @@ def _threads(pixels: int) -> int:
     """For so many of templates. They sleep while there is nothing to do; but one that is interrupted in its last
     template has the others wait for a time slice, so that less work is not shared."""
     return 1 if pixels < PIXELS_PER_THREAD else min(1 + pixels // PIXELS_PER_THREAD, threads_of_caller())
+
+
+def _bent(distortion: Tensor | None, count: int) -> int:
+    """Where it lies. Raises ValueError if it is not one of so many templates."""
+    if distortion is None:
+        return 0
+    if distortion.shape != (count, 2, 2) or distortion.dtype != torch.float64 or not distortion.is_contiguous():
+        raise ValueError(f"distortion: expected float64 ({count}, 2, 2), got {distortion.dtype}, {distortion.shape}")
+    return distortion.data_ptr()
 
 
 def _places(trust: Trust, sums: Tensor) -> tuple[int, int]:

@@ -32,6 +32,7 @@ def takes(reference: Reference, image: Tensor, settings: Settings) -> bool:
         and reference.place.radius.dtype == torch.float64  # float32 where it was prepared on Apple's MPS
         and settings.interpolation in DEGREE
         and _code(reference.criterion) is not None
+        and (reference.distortion is None or not torch.compiler.is_compiling())
         and load() is not None
     )
 
@@ -50,8 +51,10 @@ def solve(
     if library is None or code is None:
         raise ValueError("native: expected what it takes")
     how = DEGREE[settings.interpolation], settings.max_iterations, settings.tolerance, code
-    answer = operator.traced if torch.compiler.is_compiling() else call
-    partial, found = answer(library, image, start, reference.packed, how, trust)
+    if torch.compiler.is_compiling():
+        partial, found = operator.traced(library, image, start, reference.packed, how, trust)
+    else:
+        partial, found = call(library, image, start, reference.packed, how, trust, reference.distortion)
     pose, error, iterations, gain, sums, total, moments = found
     normal = _counted(reference, moments, trust) if partial else reference.normal
     return Solution(pose, error, iterations, gain, sums, total, normal)

@@ -106,13 +106,15 @@ class _Groups(NamedTuple):
     noise: Noise
     coarse: Reference | None
     sight: Sight | None = None
+    distortion: Tensor | None = None
 
 
 class Reference(_Groups):
     """B prepared templates of N pixels under a criterion of p columns: ``K`` (B, p, N), and what else is constant.
 
     ``coarse``: the same templates on a coarser grid, with a K of their own, for the first iterations; None where all
-    pixels are few enough. ``sight``: None where the camera has no marks.
+    pixels are few enough. ``sight``: None where the camera has no marks. ``distortion`` D (B, 2, 2): the templates are
+    seen at x = R(theta) (I + D) x' + t; None where they are seen as they are.
     """
 
     @property
@@ -153,7 +155,16 @@ class Reference(_Groups):
     def warps(self, pose: Tensor) -> Tensor:
         """2x3 warps (B, 2, 3) that take the grid's pixels to the frame at poses (B, 3): eq. (2) about the centre."""
         turn = rotation(pose[:, 2])
+        if self.distortion is not None:
+            turn = turn + turn @ self.distortion.to(turn)
         return torch.cat((turn, pose[:, :2, None] - turn @ self.place.centre.to(pose.dtype)[:, :, None]), 2)
+
+    def distorted(self, distortion: Tensor | None) -> Reference:
+        """The same templates, seen with another ``distortion`` (B, 2, 2)."""
+        coarse = None if self.coarse is None else self.coarse.distorted(distortion)
+        other = self._replace(coarse=coarse, distortion=distortion)
+        other.__dict__ = self.__dict__  # what is made once depends on no distortion
+        return other
 
     def select(self, index: Tensor | slice) -> Reference:
         """The reference of the templates at ``index`` (n,); of a slice without a copy."""

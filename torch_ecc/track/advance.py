@@ -10,10 +10,17 @@ from torch import Tensor
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.track.budget import BURST
 
+PREDICTIONS = ("hold", "velocity")
 MEMORY = 0.05  # weight of the newest frame in the usual score
 KEPT = 16  # frames for which a template that is not found is expected to go on as before
 
 State = Mapping[str, Tensor]  # a tracker's buffers: see there
+
+
+def check_prediction(prediction: str) -> None:
+    """ValueError for one that is not known."""
+    if prediction not in PREDICTIONS:
+        raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
 
 
 def beginning(start: Tensor) -> dict[str, Tensor]:

@@ -18,8 +18,8 @@ from torch_ecc.core.ambient import lasting
 from torch_ecc.core.criteria import Criterion
 from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.patches import Crop
-from torch_ecc.core.pose import compose, rotation
 from torch_ecc.core.pose import inverse as inverse_pose
+from torch_ecc.core.pose import rotation
 from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.sampling import SAMPLERS, inside, make_sampler
 from torch_ecc.core.sight import eroded, picked
@@ -114,6 +114,12 @@ def as_rounds(average: int, renew: int | None) -> tuple[int, int]:
     return average if average > 1 else renew, renew
 
 
+def teaches(estimate: Estimate, suspects: list[bool]) -> Tensor:
+    """Which templates (R,) a frame may teach."""
+    right = (estimate.status == Status.CONVERGED) & (estimate.origin == Origin.TRACKED)
+    return right & (estimate.coverage >= HIGH) & ~torch.tensor(suspects, device=right.device)
+
+
 class Teacher:
     """Of one tracker: what it makes of frames, and when, in ``rounds`` of ``as_rounds``. ``shown`` (H, W): where the
     camera shows the scene."""
@@ -125,30 +131,28 @@ class Teacher:
         self.surface: Surface | None = None  # of the templates as they are
 
     @lasting
-    def __call__(self, image: Tensor, estimate: Estimate, suspects: list[bool], state: State) -> Tensor:
-        """Learn from an ``image`` (1 or R, 1, H, W); which templates (n,) have become others, in the ``state``. Frames
-        in which one is suspect teach it nothing."""
+    def __call__(self, image: Tensor, warp: Tensor, teachable: Tensor, state: State) -> Tensor:
+        """Learn from an ``image`` (1 or R, 1, H, W), which shows the templates at ``warp`` (R, 2, 3), if it is
+        ``teachable`` (R,); which of them (n,) have become others, in the ``state``."""
         (first, later), crop, lessons = self.rounds, Crop(*(state[name] for name in Crop._fields)), lessons_in(state)
         if lessons is None:
             return torch.empty(0, dtype=torch.long)
-        usual = ~torch.tensor(suspects, device=lessons.place.device)
         lengths = torch.where(lessons.rounds == 0, first, later)
-        right = (estimate.status == Status.CONVERGED) & (estimate.origin == Origin.TRACKED)
-        which = (right & usual & (estimate.coverage >= HIGH) & (lengths > 0)).nonzero()[:, 0]
+        which = (teachable & (lengths > 0)).nonzero()[:, 0]
         if len(which) == 0:
             return which
-        self.learn(image if len(image) == 1 else image[which], estimate.pose[which], which, crop, lessons)
+        self.learn(image if len(image) == 1 else image[which], warp[which], which, crop, lessons)
         done = which[lessons.learned[which] >= lengths[which]]
         if len(done) > 0:
             self.renew(done, crop, lessons)
         return done
 
-    def learn(self, image: Tensor, pose: Tensor, which: Tensor, crop: Crop, lessons: Lessons) -> None:
-        """What the templates at ``which`` (n,) show at ``pose`` (n, 3)."""
+    def learn(self, image: Tensor, warp: Tensor, which: Tensor, crop: Crop, lessons: Lessons) -> None:
+        """What the templates at ``which`` (n,) show at ``warp`` (n, 2, 3)."""
         if self.surface is None:
             self.surface = Surface.of(self.criterion, *crop)
         part = self.surface if len(which) == len(crop.mask) else self.surface.select(which)
-        g, warp, grid = sampled(image.float(), self.interpolation, pose, crop.template, crop.centre[which])
+        g, grid = sampled(image.float(), self.interpolation, warp, crop.template), pixels(crop.template)
         seen = inside(warp, grid, image.shape[2:])
         if self.shown is not None:
             seen &= picked(self.shown, warp, grid)
@@ -216,20 +220,18 @@ class Teacher:
         lessons.lag[which] = torch.lerp(lessons.lag[which], step[:, :, None] * step[:, None], share.to(step))
 
 
-def sampled(
-    image: Tensor, interpolation: str, pose: Tensor, template: Tensor, centre: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """What an ``image`` (1 or n, 1, H, W) shows at ``pose`` (n, 3) of the pixels (3, N) of ``template`` (R, 1, h, w)
-    about the ``centre`` (n, 2), (n, N), the warps (n, 2, 3) there, and the pixels."""
-    grid, turn = pixels(template), rotation(pose[:, 2])
-    warp = torch.cat((turn, pose[:, :2, None] - turn @ centre.to(pose)[:, :, None]), 2)
-    box = torch.stack((grid[:, 0], grid[:, template.shape[3] - 1], grid[:, -1], grid[:, -template.shape[3]]), 1)
-    return make_sampler(interpolation, image, warp, box)(warp, grid), warp, grid
+def sampled(image: Tensor, interpolation: str, warp: Tensor, template: Tensor) -> Tensor:
+    """What an ``image`` (1 or n, 1, H, W) shows at ``warp`` (n, 2, 3) of the N pixels of ``template`` (R, 1, h, w):
+    (n, N)."""
+    grid, width = pixels(template), template.shape[3]
+    box = torch.stack((grid[:, 0], grid[:, width - 1], grid[:, -1], grid[:, -width]), 1)
+    return make_sampler(interpolation, image, warp, box)(warp, grid)
 
 
 def shifted(mean: Tensor, interpolation: str, step: Tensor, centre: Tensor) -> Tensor:
     """Images ``mean`` (n, 1, h, w), of a pose that is off by ``step`` (n, 3) about the ``centre`` (n, 2), put right."""
-    h, w = mean.shape[2:]
-    middle = step.new_tensor(((w - 1) / 2, (h - 1) / 2, 0)) + torch.nn.functional.pad(centre.to(step), (0, 1))
-    pose = compose(middle, inverse_pose(step))
-    return sampled(mean, interpolation, pose, mean, centre)[0].view_as(mean)
+    back, about = inverse_pose(step), centre.to(step)[:, :, None]
+    turn = rotation(back[:, 2])
+    middle = step.new_tensor([[(n - 1) / 2] for n in (mean.shape[3], mean.shape[2])])
+    warp = torch.cat((turn, middle + about + back[:, :2, None] - turn @ about), 2)
+    return sampled(mean, interpolation, warp, mean).view_as(mean)

@@ -23,19 +23,18 @@ from torch_ecc.core.pyramid import check_levels, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, seen_through
-from torch_ecc.core.solver import State, iterate
 from torch_ecc.core.verdict import expected_score
-from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, detrended_zncc_at, image_pyramid
-from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, skipped
+from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, image_pyramid
+from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, skipped
 from torch_ecc.track.budget import Budget, income
+from torch_ecc.track.coarse import coarse_to_fine
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, told
+from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, teaches, told
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
 from torch_ecc.track.sensor import dead_in, shown
+from torch_ecc.track.shutter import Shutter
 
-PREDICTIONS = ("hold", "velocity")
-COARSE_TOLERANCE = 0.1  # px of a coarse level
 DERIVED = ("references", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
 
 
@@ -69,7 +68,9 @@ class Tracker(nn.Module):
     many frames, the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last so
     many frames, again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up,
     and sigma tells what the anchor is still worth. Nothing is learned from frames that are not CONVERGED or are
-    covered, nor where something is suddenly another.
+    covered, nor where something is suddenly another. ``line_time``: seconds from the exposure of one row to the next,
+    of a camera with a rolling shutter that takes ``fps`` frames per second: poses are those of the instant at which the
+    row of the template's centre is exposed (``track.shutter``); in the first frame it is at rest.
 
     What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
     with its own options. A state comes whole or not at all; what does not fit is refused before anything is changed.
@@ -118,15 +119,18 @@ class Tracker(nn.Module):
         backend: str = "auto",
         average: int = 1,
         renew: int | None = None,
+        line_time: float | None = None,
+        fps: float | None = None,
     ) -> None:
         super().__init__()
-        _check_prediction(prediction)
-        self.rounds = as_rounds(average, renew)  # frames that the first lesson takes, and each later one
+        check_prediction(prediction)
+        self.rounds, self.shutter = as_rounds(average, renew), Shutter.of(line_time, fps)
         self.settings = Settings(interpolation, max_iterations, tolerance, min_score, min_visible, robust, backend)
         self.prediction, self.search, self.criterion = prediction, search, make_criterion(criterion, illumination)
         self.max_step, self.income = MaxStep.of(max_step), income(search_share)
         gray = as_gray("Tracker", "frame", frame, as_device("Tracker", device))
         self.frame_shape, self.levels = tuple(gray.shape), levels
+        self.shutter.check(gray.shape[2])
         self.dead = dead_in("Tracker", gray)
         gray = gray if self.dead is None else self.dead.repair(gray)
         self.frame_mask = shown("Tracker", frame_mask, gray)
@@ -138,7 +142,8 @@ class Tracker(nn.Module):
         """The state before the first frame that is tracked."""
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
         first = _kept(filled(gray, self.frame_mask))  # frame: what else in it looks like them?
-        for name, value in {**templates._asdict(), "first": first, **beginning(start)}.items():
+        past = self.shutter.beginning(start)
+        for name, value in {**templates._asdict(), "first": first, **beginning(start), **past}.items():
             self.register_buffer(name, value)
         self._use(self._prepared(self._buffers))
         self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
@@ -202,11 +207,15 @@ class Tracker(nn.Module):
 
     def _learned(self, image: Tensor, estimate: Estimate, suspects: list[bool]) -> Estimate:
         """The ``estimate`` of an ``image``, from which the templates have learned."""
+        state = self._buffers
         if self.learns:
+            distortion = self.shutter.distortion(estimate.pose, state)
+            warp = self.references[0].distorted(distortion).warps(estimate.pose)
             with torch.no_grad():
-                new = self._teacher(image, estimate, suspects, self._buffers)
+                new = self._teacher(image, warp, teaches(estimate, suspects), state)
                 if len(new) > 0:
-                    self._use(renewed(self.references, new, self._buffers, self._prepared))
+                    self._use(renewed(self.references, new, state, self._prepared))
+        self.shutter.remember(state, estimate)
         return estimate
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -298,7 +307,8 @@ class Tracker(nn.Module):
         estimate = self._within_reach(self._solve(image, images, start))
         doubtful, past = any(suspect(estimate, state["score"])), Past.of(state)
         if doubtful:
-            estimate = self._within_reach(from_rest(self.references[0], images[0], estimate, past, self.settings))
+            reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
+            estimate = self._within_reach(from_rest(reference, images[0], estimate, past, self.settings))
         if doubtful and self.search:
             estimate = self._within_reach(self._recovery(images, estimate, start, past))
             suspects = suspect(estimate, state["score"])
@@ -324,6 +334,7 @@ class Tracker(nn.Module):
     @torch.no_grad()
     def skip(self) -> Estimate:
         """The record (R, ...) of a frame that cannot be looked at: the last good poses, and Status.DAMAGED."""
+        self.shutter.wait(self._buffers)
         return skipped(self._buffers)
 
     @torch.no_grad()
@@ -358,22 +369,17 @@ class Tracker(nn.Module):
         return Track.stack(estimates)
 
     def _solve(self, image: Tensor, images: list[Tensor], pose: Tensor) -> Estimate:
-        """Coarse to fine; ``images`` holds the ``image`` without gradients and grows to as many levels as there are.
-        What a level has found is kept only if it looks better to the next finer one than its start: fine texture is not
-        there in a coarse level, which then leads anywhere."""
+        """Coarse to fine; ``images`` holds the ``image`` without gradients and grows to as many levels as there are."""
         if self.levels > 1:
             image = filled(image.float(), self.frame_mask)
             images[:] = image_pyramid(image.detach(), self.levels)
-        most = self.settings.max_iterations
-        for level in range(self.levels - 1, 0, -1):
-            scale, double = (pose.new_tensor((s, s, 1.0)) for s in (2.0**level, 2.0))
-            state, *_ = iterate(
-                self.references[level], images[level], "bilinear", State.start(pose / scale), COARSE_TOLERANCE, most
-            )
-            finer = self.references[level - 1], images[level - 1]
-            better = detrended_zncc_at(*finer, state.pose * double) > detrended_zncc_at(*finer, pose / scale * double)
-            pose = torch.where(better[:, None], state.pose * scale, pose)
-        return solve(self.references[0], image, pose, self.settings, self._buffers["start"], self._buffers["score"])
+            pose = coarse_to_fine(self.references, images, pose, self.settings.max_iterations)
+        start, usual = self._buffers["start"], self._buffers["score"]
+
+        def look(reference: Reference, there: Tensor) -> Estimate:
+            return solve(reference, image, there, self.settings, start, usual)
+
+        return self.shutter.solve(look, self.references[0], pose, self._buffers, self.settings.tolerance)
 
 
 def _kept(frame: Tensor) -> Tensor:
@@ -387,11 +393,6 @@ def _warn_of_textureless(each: list[bool]) -> None:
     if which:
         names = f"template {which[0]}" if len(which) == 1 else f"templates {', '.join(map(str, which))}"
         warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=7)
-
-
-def _check_prediction(prediction: str) -> None:
-    if prediction not in PREDICTIONS:
-        raise ValueError(f"prediction: expected one of {list(PREDICTIONS)}, got {prediction!r}")
 
 
 def _words(shape: tuple[int, ...]) -> str:

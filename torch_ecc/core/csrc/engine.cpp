@@ -31,6 +31,7 @@ struct Call {  // entry.CALL
   const double* start;   // (B, 3)
   const int64_t* index;  // (count,) of the templates that trust is about, or null
   const float* trust;    // (count, blocks), or null
+  const double* distortion;  // (B, 2, 2), or null
   double *pose, *error;  // (count, 3), (count,); and so on, see solution.Solution
   int64_t* iterations;
   double* gain;
@@ -52,7 +53,8 @@ bool answer(const Call& call, int64_t b) {
   const Template t{call.criterion, call.criterion < 0 ? 3 : 5 + call.criterion, bool(call.coarser),
                    call.whole.of(which, trust, across), call.coarse.of(which, trust, across)};
   const double* const at = call.start + 3 * which;
-  State state{{at[0], at[1], at[2]}};
+  State state{{at[0], at[1], at[2]}, {0, 0, 0, 0}};
+  if (call.distortion) std::copy_n(call.distortion + 4 * which, 4, state.distortion);
   float* const sums = call.sums + b * SUMS * each;
   double* const total = call.total + b * (SUMS + 3);
   const bool seen = solve(t, call.frame.after(which * call.next_frame), call.settings, state, scratch);

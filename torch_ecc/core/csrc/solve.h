@@ -9,7 +9,7 @@ constexpr double INFINITE = HUGE_VAL;
 constexpr int64_t BAND = 4 * BLOCK;  // rows that are sampled and summed together
 
 struct State {
-  double pose[3], delta[3] = {0, 0, 0}, length = 0, scale = 1, error = INFINITE;
+  double pose[3], distortion[4], delta[3] = {0, 0, 0}, length = 0, scale = 1, error = INFINITE;
   int64_t iterations = 0;
 };
 
@@ -30,10 +30,11 @@ struct Scratch {  // of one thread, kept from call to call
   Weights seen(const Pixels& p) const { return partial ? Weights{border.seen.data(), p.pitch} : p.weights; }
 };
 
-// Of pixel positions relative to the template's centre: eq. 2. Here alone it is a rotation.
-inline Warp warp_of(const double (&pose)[3]) {
-  const double c = std::cos(pose[2]), s = std::sin(pose[2]);
-  return {c, s, -s, c, pose[0], pose[1]};
+// Of pixel positions relative to the template's centre: R (I + D) x' + t, with R of eq. 2.
+inline Warp warp_of(const State& state) {
+  const double c = std::cos(state.pose[2]), s = std::sin(state.pose[2]), *const d = state.distortion;
+  const double xu = 1 + d[0], xv = d[1], yu = d[2], yv = 1 + d[3];
+  return {c * xu + s * yu, c * xv + s * yv, c * yu - s * xu, c * yv - s * xv, state.pose[0], state.pose[1]};
 }
 
 // Smallest rectangle around the warped template.
@@ -156,7 +157,7 @@ bool iterate(const Template& t, const Pixels& p, const Frame& frame, double tole
   state.error = INFINITE;
   for (int64_t row = 0; row < BAND; ++row) fetch(p, row, 3);
   for (bool anew = true; state.iterations < most && state.error > tolerance; anew = false) {
-    const Warp warp = warp_of(state.pose);
+    const Warp warp = warp_of(state);
     Model& m = scratch.model;
     const bool seen = find<degree>(t, p, frame, warp, anew, scratch);
     if (seen) {

@@ -1,0 +1,143 @@
+"""Laws of rolling shutters: what each row sees at a time of its own is seen as one pose, whatever moves how."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from engines import BACKENDS
+from torch import Tensor
+
+from torch_ecc import Status, Tracker
+from torch_ecc.core.pose import rotation
+from torch_ecc.sim import PlaneWaves
+from torch_ecc.track.shutter import Shutter
+
+FRAME, SIZE, FPS = (120, 140), 61, 29.97
+READ = 0.9  # of a frame's time, for all its rows
+LINE = READ / FRAME[0]
+SCENE = PlaneWaves.random(seed=2)
+
+
+def sway(time: float, center: tuple[float, float] = (70.0, 58.0)) -> Tensor:
+    """Pose (3,): at rest until 0, and then up to 3.5 px per frame in x, and up and down."""
+    t = max(time, 0.0)
+    x, y = center
+    return torch.tensor((x + 5 * math.sin(0.7 * t), y + 3 * math.sin(0.5 * t), 0.0), dtype=torch.float64)
+
+
+def drift(time: float) -> Tensor:
+    """A constant speed along a slope, turned."""
+    return torch.tensor((50 + 2.1 * max(time, 0), 50 + 1.3 * max(time, 0), 0.0), dtype=torch.float64)
+
+
+def exposed(path, time: float) -> Tensor:
+    """A frame (h, w) whose rows see the scene at poses of their own."""
+    rows = []
+    for row in range(FRAME[0]):
+        pose = path(time + LINE * (row - FRAME[0] / 2) if time else 0.0)
+        rows.append(SCENE.render((pose - torch.tensor((0.0, row, 0.0)))[None], (1, FRAME[1]))[0, 0])
+    return torch.cat(rows)
+
+
+def truth(path, time: float) -> Tensor:
+    """The pose (3,) when the row of the target's centre is exposed."""
+    pose = path(time)
+    for _ in range(8):
+        pose = path(time + LINE * (float(pose[1]) - FRAME[0] / 2))
+    return pose
+
+
+def errors(path, times: list[float], frames: list[Tensor | None], **options) -> tuple[Tensor, Tensor]:
+    """Of the poses (F, 3), and statuses (F,)."""
+    tracker = Tracker(exposed(path, 0.0), [path(0.0)[:2].tolist()], SIZE, search=False, **options)
+    track = tracker.track_sequence(frames)
+    return track.pose[:, 0] - torch.stack([truth(path, t) for t in times]), track.status[:, 0]
+
+
+SWAY = [exposed(sway, float(k)) for k in range(1, 25)]
+TIMES = [float(k) for k in range(1, 25)]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_sway_is_no_turn(backend: str) -> None:
+    """0.02 degrees where it was a quarter of one; x and y no worse."""
+    known, _ = errors(sway, TIMES, SWAY, line_time=LINE / FPS, fps=FPS, backend=backend)
+    plain, _ = errors(sway, TIMES, SWAY, backend=backend)
+    rms = [float(e[5:, 2].square().mean().sqrt().rad2deg()) for e in (known, plain)]
+    assert rms[1] > 0.3
+    assert rms[0] < 0.04
+    assert bool((known[5:, :2].square().mean(0) <= plain[5:, :2].square().mean(0)).all())
+
+
+def test_what_moves_evenly_is_seen_exactly() -> None:
+    """From the third frame on there is nothing to be wrong about."""
+    times = [float(k) for k in range(1, 9)]
+    error, _ = errors(drift, times, [exposed(drift, t) for t in times], line_time=LINE / FPS, fps=FPS)
+    assert float(error[4:, :2].abs().max()) < 5e-3
+    assert float(error[4:, 2].abs().max().rad2deg()) < 5e-3
+
+
+def test_frames_in_between_are_lost() -> None:
+    """Two that are missing, one without the target: time goes on."""
+    frames: list[Tensor | None] = list(SWAY)
+    frames[8], frames[9], frames[15] = None, None, torch.full_like(SWAY[0], 90)
+    error, status = errors(sway, TIMES, frames, line_time=LINE / FPS, fps=FPS)
+    good = Status.good(status)
+    assert int(good.sum()) >= len(frames) - 5
+    assert float(error[20:, 2].abs().max().rad2deg()) < 0.06
+
+
+def test_a_shutter_that_reads_upwards_has_a_negative_time() -> None:
+    """The picture upside down, which turns x and y of the motion as well."""
+    frames = [frame.flip(0) for frame in SWAY]
+    first = exposed(sway, 0.0).flip(0)
+    center = (70.0, FRAME[0] - 1 - 58.0)
+    tracker = Tracker(first, [center], SIZE, search=False, line_time=-LINE / FPS, fps=FPS)
+    theta = tracker.track_sequence(frames).pose[5:, 0, 2]
+    assert float(theta.square().mean().sqrt().rad2deg()) < 0.04
+
+
+def test_a_velocity_is_that_of_a_polynomial() -> None:
+    """Of one of the fourth degree exactly, with frames that are missing; of fewer poses that of a lower degree."""
+    shutter = Shutter(0.0)
+    ages = torch.tensor([[1.0, 2.0, 5.0, 6.0], [1.0, 3.0, 0.0, 0.0]], dtype=torch.float64)
+
+    def path(t: Tensor, degree: int) -> Tensor:
+        return torch.stack([sum((k + 1.5) * (c - k) * t**k for k in range(degree + 1)) for c in (1, 2, 4)], -1)
+
+    past = torch.stack((path(-ages[0], 4), path(-ages[1], 2)))
+    now = torch.stack((path(torch.zeros(()).double(), 4), path(torch.zeros(()).double(), 2)))
+    found = shutter.velocity(now, {"past_poses": past, "past_ages": ages})
+    expected = torch.tensor([[2.5 * (c - 1) for c in (1, 2, 4)]] * 2, dtype=torch.float64)
+    torch.testing.assert_close(found, expected)
+
+
+def test_rows_lie_where_the_distortion_says() -> None:
+    """A point is seen where it is when its row is exposed."""
+    pose, velocity = torch.tensor([[70.0, 50.0, 0.4]], dtype=torch.float64), torch.tensor((3.0, -2.0)).double()
+    past = torch.stack([pose[0] - k * torch.tensor((3.0, -2.0, 0.0)).double() for k in range(1, 5)])
+    shutter = Shutter(0.01)
+    state = {"past_poses": past[None], "past_ages": torch.tensor([[1.0, 2.0, 3.0, 4.0]], dtype=torch.float64)}
+    turn = rotation(pose[:, 2])[0]
+    speed = shutter.velocity(pose, state)[0, :2]
+    torch.testing.assert_close(speed, velocity / 0.98)  # two rows higher up in each frame, so a little earlier
+    point = torch.tensor((20.0, -13.0), dtype=torch.float64)
+    seen = turn @ (torch.eye(2).double() + shutter.distorted(pose, state)[0]) @ point
+    torch.testing.assert_close(seen, turn @ point + 0.01 * seen[1] * speed)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"line_time": 1e-5}, "fps: expected a rate > 0 in frames per second with line_time, got None"),
+        ({"line_time": 1e-5, "fps": 0}, "fps: expected a rate > 0 in frames per second with line_time, got 0"),
+        ({"line_time": "fast", "fps": 30}, "line_time: expected seconds from one row to the next, got 'fast'"),
+        ({"line_time": math.nan, "fps": 30}, "line_time: expected seconds from one row to the next, got nan"),
+        ({"line_time": 1e-3, "fps": 30}, "line_time: expected the 120 rows of a frame to be read out before the next"),
+    ],
+)
+def test_times_that_no_camera_has_are_refused(options: dict, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        Tracker(torch.rand(FRAME), [(70.0, 58.0)], SIZE, **options)
