@@ -8,6 +8,7 @@ there (and torch_ecc itself, to compare with), the foreign libraries solve a pro
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import struct
 import subprocess
@@ -35,7 +36,7 @@ GLIBC = (2, 17)
 EMULATORS = {
     "windows-amd64": ["wine"],
     "linux-aarch64": ["qemu-aarch64", "-L", "/usr/aarch64-linux-gnu"],
-    "linux-x86_64": ["env"],
+    f"linux-{platform.machine()}": ["env"],  # this machine itself
 }
 
 
@@ -128,10 +129,11 @@ class Problem:
 
 def run_elsewhere(name: str, libraries: list[Path], folder: Path) -> None:
     """Prints how far the poses of a foreign library are from those here."""
-    emulator, problem = EMULATORS.get(name, ["none"]), Problem()
-    if shutil.which(emulator[0]) is None:
-        print(f"  not run: {emulator[0]} is not there")
+    emulator = EMULATORS.get(name, [])
+    if not emulator or shutil.which(emulator[0]) is None:
+        print(f"  not run: there is no {emulator[0] if emulator else 'emulator of it'}")
         return
+    problem = Problem()
     program, target = folder / "elsewhere.exe", TARGETS[name]
     zig = [sys.executable, "-m", "ziglang", "cc", "-target", target.zig, "-O2", str(HERE / "elsewhere.c")]
     subprocess.run([*zig, "-o", str(program), *(["-ldl"] if target.suffix == ".so" else [])], check=True)
