@@ -117,7 +117,7 @@ def lenses(frames: int) -> list[Number]:
     header = ("lens", "body px rms", "nm", "theta urad", "patches px rms")
     show(f"A lens of 0.5 %, {frames} frames: {fit}", header, rows)
     line = plan.middle + torch.linspace(-170, 170, 6, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0])
-    for words, moves, commanded in (("one direction", line, True), ("no move", line[:1].expand(6, 3), False)):
+    for words, moves, commanded in (("one direction", line, True), ("no move", plan.middle.expand(6, 3), False)):
         tracker, track = _followed(plan, lens, moves)
         sent = UM_PER_PX * (moves - plan.middle)[:, :2] if commanded else None
         try:

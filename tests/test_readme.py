@@ -45,6 +45,14 @@ def test_the_search_block_runs():
     assert not names["found"].ambiguous
 
 
+def test_the_body_block_runs():
+    names: dict[str, object] = {}
+    exec(BLOCKS[0], names)
+    exec(next(block for block in BLOCKS if "te.Body" in block), names)
+    assert names["found"].used.all()
+    assert names["found"].sigma[0, 2] < 1e-4
+
+
 def test_first_screen():
     """One sentence, one picture, the two commands and an example before anything else."""
     first = README[: README.index("## ")]

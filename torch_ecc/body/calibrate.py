@@ -33,6 +33,7 @@ SCALE = ("f_x", "f_y", "axis_angle")
 UNITS = {"k1": 0.01, "k2": 0.01, "p1": 0.01, "p2": 0.01, "center_x": 0.1, "center_y": 0.1}  # the center's in focals
 LEAST_RELATIVE = 0.1  # of a scale, and of an angle in rad: known no better is not known
 FAR_UM = 1e6  # of the offset between two origins: whatever it is
+LEAST_SPREAD = 0.01  # of the longest moves: across them, less tells nothing to begin with
 TAKES_PART = 0.3  # of a direction of unit length
 MOST = 60  # frames, evenly spread, that are compared
 STEPS = 12
@@ -218,7 +219,7 @@ def _begun(problem: _Problem) -> _State:
     if SCALE[0] in problem.asked:
         px, um = (body - layout.start)[known, :2], problem.commanded[known]
         px, um, shift = px - px.mean(0), um - um.mean(0), (px.mean(0), um.mean(0))
-        affine = (torch.linalg.pinv(px, rtol=1e-6) @ um).mT
+        affine = (torch.linalg.pinv(px, rtol=LEAST_SPREAD) @ um).mT
         mirrored = bool(affine.det() < 0)
         turn, whole = affine[0, 1] - affine[1, 0], affine[0, 0] + affine[1, 1]
         if mirrored:
