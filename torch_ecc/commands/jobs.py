@@ -181,7 +181,7 @@ class BatchJob:
         for name in ("workers", "parts"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"{name}: expected 1 or more, got {value}")
-        if self.scheduler is not None and not re.fullmatch(r"(\w+://)?\S+:\d+/?", self.scheduler):
+        if self.scheduler is not None and not re.fullmatch(r"\w+://\S+|\S+:\d+", self.scheduler):
             raise ValueError(f"scheduler: expected an address as tcp://10.0.0.1:8786, got {self.scheduler!r}")
 
 
