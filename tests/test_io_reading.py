@@ -348,7 +348,7 @@ def test_camera(monkeypatch, source):
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
     monkeypatch.setattr(FakeCamera, "opened", 0)
     monkeypatch.setattr(FakeCamera, "ready", threading.Semaphore(1))
-    live._opened.cache_clear()
+    live.close_cameras()
     camera = open_frames(source)
     assert (camera.length, camera.fps, camera.shape) == (None, 30.0, (4, 6))
     with pytest.raises(TypeError, match="number of frames of opencv 3 is not known"):

@@ -22,8 +22,16 @@ from torch_ecc.io import open_frames
 from torch_ecc.io.cameras.newest import Newest, Shot
 from torch_ecc.io.cameras.test_pattern import moved, open_test
 from torch_ecc.io.frames import Arrival, Frame
+from torch_ecc.io.live import close_cameras
 from torch_ecc.servo import Control, MicroManagerStage, StageJacobian, servo
 from torch_ecc.sim.scene.waves import PlaneWaves
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _closed():
+    """What was opened does not go on beside other tests."""
+    yield
+    close_cameras()
 
 
 def test_a_frame_that_nobody_takes_gives_way_to_the_next():

@@ -294,7 +294,7 @@ def click_a_curve(page) -> None:
     chart = page.locator(".chart canvas").first
     chart.scroll_into_view_if_needed()
     box = chart.bounding_box()
-    page.mouse.click(box["x"] + 58 + (box["width"] - 66) * 10 / 29, box["y"] + 40)
+    page.mouse.click(box["x"] + 66 + (box["width"] - 74) * 10 / 29, box["y"] + 40)
     page.wait_for_selector("#said:has-text('Frame 10')")
     assert page.inner_text("#number") == "10 of 55"
     assert " ± " in page.inner_text(".chart figcaption >> nth=0")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
 from importlib import import_module
 from types import MappingProxyType
 from typing import Final
@@ -33,19 +32,29 @@ def open_live(address: str) -> Medium:
         raise ValueError(
             f"open_frames: a camera is {PREFIX}KIND:WHICH, KIND one of {', '.join(KINDS)}, got {address!r}"
         )
-    camera, fps = _opened(kind, which)
+    if (kind, which) not in _OPEN or _OPEN[kind, which][0].ended:
+        _OPEN[kind, which] = _opened(kind, which)
+    camera, fps = _OPEN[kind, which]
     return medium_of(camera, f"camera {which or kind}", fps)
 
 
-@cache  # a device can be opened once: whoever asks again is given the same
+def close_cameras() -> None:
+    """All that were opened by their address: they run on until then."""
+    for camera, _ in _OPEN.values():
+        camera.close()
+    _OPEN.clear()
+
+
+_OPEN: dict[tuple[str, str], tuple[Newest, float | None]] = {}  # a device can be opened once: all share it
+atexit.register(close_cameras)  # their threads must not be in a driver when the interpreter ends
+
+
 def _opened(kind: str, which: str) -> tuple[Newest, float | None]:
     opener, extra = KINDS[kind]
     module = import_module(f"torch_ecc.io.cameras.{_MODULES.get(kind, kind)}")
     open_it: Callable[[str], tuple[Newest, float | None]] = getattr(module, opener)
     try:
-        camera, fps = open_it(which)
-        atexit.register(camera.close)  # its thread must not be in a driver when the interpreter ends
-        return camera, fps
+        return open_it(which)
     except ModuleNotFoundError as error:
         how = f"pip install 'torch-ecc[{extra}]'"
         raise ValueError(f"open_frames: a {kind} camera needs {error.name}: {how}") from error
@@ -66,7 +75,6 @@ def medium_of(camera: Camera, name: str, fps: float | None = None) -> Medium:
                 arrival = Arrival(shot.time_s, shot.lost)
                 yield Raw(number, shot.pixels, shot.time_s - first.time_s, arrival=arrival)
             shot = camera.grab()
-        _opened.cache_clear()
         raise FrameError(number + 1, f"{name} delivers no frame any more")
 
     return Medium(read, None, fps, live=True)

@@ -56,7 +56,7 @@ class Desk:
             self._read_marks()
             self.tracked = self.marks if self.history is not None else None
         except FALLEN as error:
-            self.problem = str(error)
+            self.problem = str(error).removeprefix("open_frames: ")
 
     def _open_result(self) -> None:
         """If the input is the folder of a result: its settings, its rows, and the input that it was made from."""
@@ -65,6 +65,9 @@ class Desk:
             return
         settings = json.loads((folder / "summary.json").read_text(encoding="utf-8")).get("settings", {})
         known = {name: value for name, value in settings.items() if name in TrackJob.__dataclass_fields__}
+        beside = folder.parent / str(known.get("input", ""))  # where it was when the run was begun
+        if not Path(known.get("input", "")).exists() and beside.exists():
+            known["input"] = str(beside)
         self.values = {"input": ""} | known | {"out": str(folder)}
         self.history = History.of(folder)
 

@@ -62,6 +62,11 @@ class Newest:
             lost, self._given = (0 if self._given < 0 else shot.number - self._given - 1), shot.number
             return shot._replace(lost=max(lost, 0))
 
+    @property
+    def ended(self) -> bool:
+        """Whether there will be no picture any more."""
+        return self._ended
+
     def close(self) -> None:
         """End it."""
         self._ended = True

@@ -101,7 +101,7 @@ export class Curves extends EventTarget {
     canvas.height = Math.round(h * devicePixelRatio);
     const context = canvas.getContext("2d");
     context.scale(devicePixelRatio, devicePixelRatio);
-    const plot = { left: 58, right: w - 8, top: 6, bottom: h - 16 };
+    const plot = { left: 66, right: w - 8, top: 6, bottom: h - 16 };
     const span = [this.#time(this.rows[0]), this.#time(this.rows.at(-1))];
     const range = this.#range(title);
     const x = (time) => plot.left + ((time - span[0]) / (span[1] - span[0] || 1)) * (plot.right - plot.left);
