@@ -142,6 +142,26 @@ def test_what_was_hidden_is_found_again_behind_what_is_left_of_the_cover():
     assert (track.pose[2, 0] - poses[3])[:2].abs().max() < 0.05
 
 
+@scenes
+def test_a_cover_that_stays_is_remembered_and_forgotten_when_it_has_gone(scene):
+    """Under it as without a memory, after it as least squares; a state knows of it."""
+    frames, poses = shots(scene)
+    hidden = covered(frames, 0.25, "dark")
+    stack = noisy(torch.stack([frames[0], *[hidden[1]] * 4, frames[2], frames[3]]))
+    robust, plain = (Tracker(stack[0], [MIDDLE], SIZE, robust=on) for on in (True, False))
+    for k in range(1, 5):
+        estimate = robust.track(stack[k])
+        assert (estimate.pose[0] - poses[1])[:2].abs().max() < 0.05
+        assert 0.6 < float(estimate.coverage) < 0.9
+        assert 0.6 < float(robust.trust.mean()) < 0.9
+    plain.pose = robust.pose
+    for k in (5, 6):
+        estimate = robust.track(stack[k])
+        assert estimate.coverage == 1
+        assert bool((robust.trust == 1).all())
+        torch.testing.assert_close(estimate.pose, plain.track(stack[k]).pose, atol=2e-3, rtol=0)
+
+
 def test_trust_falls_with_what_is_too_much():
     ratio = torch.tensor([[0.0, 1.0, 3.0, 3.3, 6.0, 30.0, math.inf]])
     value = trust(ratio)[0]

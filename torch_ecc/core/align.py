@@ -55,21 +55,35 @@ def solve(
     pose: Tensor,
     settings: Settings,
     origin: Tensor | None = None,
-    usual: Tensor | None = None,
 ) -> Estimate:
     """``align`` without its checks: an image of ``as_image``, poses (B, 3) of the reference's pose dtype; ``origin``:
-    what displacements count from, by default the ``pose``; ``usual`` (B,): the templates' scores so far."""
+    what displacements count from, by default the ``pose``."""
+    return solve_again(reference, image, pose, settings, origin)[0]
+
+
+def solve_again(
+    reference: Reference,
+    image: Tensor,
+    pose: Tensor,
+    settings: Settings,
+    origin: Tensor | None = None,
+    memory: robust.Memory | None = None,
+) -> tuple[Estimate, Tensor | None]:
+    """The same with a ``memory`` of the frames before; and the trust (B, blocks) to be remembered, None if it is
+    whole."""
     if not implicit.wanted(reference, image, pose):
-        return judge(reference, found(reference, image, pose, settings, usual), pose, settings, origin)
+        there = found(reference, image, pose, settings, memory)
+        return judge(reference, there, pose, settings, origin), there.trust
     with torch.no_grad():
-        there = found(reference, image.detach(), pose.detach(), settings, usual)
-    return judge(reference, implicit.attached(reference, image, pose, there, settings), pose, settings, origin)
+        there = found(reference, image.detach(), pose.detach(), settings, memory)
+    attached = implicit.attached(reference, image, pose, there, settings)
+    return judge(reference, attached, pose, settings, origin), there.trust
 
 
 def found(
-    reference: Reference, image: Tensor, pose: Tensor, settings: Settings, usual: Tensor | None = None
+    reference: Reference, image: Tensor, pose: Tensor, settings: Settings, memory: robust.Memory | None = None
 ) -> Solution:
     """What the engine for these B templates finds."""
     engine = native.solve if native.takes(reference, image, settings) else solver.solve
     seeing = engine if reference.sight is None else partial(sight.solve, engine)
-    return robust.solve(seeing, reference, image, pose, settings, usual)
+    return robust.solve(seeing, reference, image, pose, settings, memory)

@@ -48,9 +48,22 @@ class Scale(NamedTuple):
     slip: Tensor
 
 
+class Memory(NamedTuple):
+    """What is known of B templates from the frames before: their usual ``score`` (B,), and the ``trust`` (B, blocks)
+    that there was in them in the last one."""
+
+    score: Tensor
+    trust: Tensor
+
+    @staticmethod
+    def none(reference: Reference) -> Memory:
+        """Of templates that have not been seen yet."""
+        return Memory(expected_score(reference), torch.ones_like(reference.blocks.weight))
+
+
 class Doubted(NamedTuple):
     """Templates at ``which`` (n,) of a solve by an ``engine`` that are solved again: what they have in their blocks,
-    the ``floor`` (n, 1) of the noise's variance and their ``usual`` (n,) score."""
+    the ``floor`` (n, 1) of the noise's variance, their ``usual`` (n,) score and the ``last`` (n, blocks) trust."""
 
     engine: Engine
     reference: Reference
@@ -60,19 +73,19 @@ class Doubted(NamedTuple):
     blocks: Blocks
     floor: Tensor
     usual: Tensor
+    last: Tensor
 
     @staticmethod
-    def of(engine: Engine, reference: Reference, image: Tensor, settings: Settings, usual: Tensor) -> Doubted:
+    def of(engine: Engine, reference: Reference, image: Tensor, settings: Settings, memory: Memory) -> Doubted:
         """All of them."""
-        which = torch.arange(len(usual), device=usual.device)
-        return Doubted(
-            engine, reference, image, settings, which, reference.blocks, least_noise(reference, settings), usual
-        )
+        which, floor = torch.arange(len(memory.score), device=memory.score.device), least_noise(reference, settings)
+        return Doubted(engine, reference, image, settings, which, reference.blocks, floor, *memory)
 
     def at(self, part: Tensor) -> Doubted:
         """Some of them."""
         blocks = each(lambda value: value[part], self.blocks)
-        return self._replace(which=self.which[part], blocks=blocks, floor=self.floor[part], usual=self.usual[part])
+        known = {name: getattr(self, name)[part] for name in ("which", "floor", "usual", "last")}
+        return self._replace(blocks=blocks, **known)
 
     def solve(self, start: Tensor, settings: Settings, trusted: Tensor) -> Solution:
         """From ``start`` (B, 3) on, with blocks (n, blocks) as they are trusted."""
@@ -80,17 +93,22 @@ class Doubted(NamedTuple):
 
 
 def solve(
-    engine: Engine, reference: Reference, image: Tensor, start: Tensor, settings: Settings, usual: Tensor | None = None
+    engine: Engine,
+    reference: Reference,
+    image: Tensor,
+    start: Tensor,
+    settings: Settings,
+    memory: Memory | None = None,
 ) -> Solution:
-    """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on; ``usual`` (B,): their scores so far."""
+    """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on, with a ``memory`` of the frames before."""
     found = engine(reference, image, start, settings, None)
     if not settings.robust:
         return found
-    usual, on_cpu = expected_score(reference) if usual is None else usual, is_cpu(start.device)
-    odd = unusual(reference, found, settings, usual)
+    memory, on_cpu = Memory.none(reference) if memory is None else memory, is_cpu(start.device)
+    odd = unusual(reference, found, settings, memory.score)
     if on_cpu and not odd.any():
         return found
-    doubted, plain = Doubted.of(engine, reference, image, settings, usual), found._replace(trust=whole(found))
+    doubted, plain = Doubted.of(engine, reference, image, settings, memory), found._replace(trust=whole(found))
     if on_cpu:  # nowhere else does the host ask which ones
         doubted, plain = doubted.at(odd), part_of(plain, odd)
     uneven = has_outliers(doubted, plain)
@@ -130,8 +148,12 @@ def solved_again(doubted: Doubted, start: Tensor, plain: Solution, uneven: Tenso
     score, least = correlation(plain.normal, plain.total), RECOGNISED * doubted.usual
     best, fits = best_trial(doubted, start, plain, score >= least)
     recognised = torch.maximum(score, detrended(plain.normal, plain.total)) >= least
-    most = best.normal.total >= LEAST_COVERAGE * best.sums[:, 0].sum(1)
-    return chosen((uneven | fits) & (most | ~recognised), best, plain)
+    return chosen((uneven | fits) & (covers_most(best) | ~recognised), best, plain)
+
+
+def covers_most(found: Solution) -> Tensor:
+    """Where (n,) enough of what is in sight is believed."""
+    return found.normal.total >= LEAST_COVERAGE * found.sums[:, 0].sum(1)
 
 
 def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Tensor) -> tuple[Solution, Tensor]:
@@ -142,16 +164,22 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
     there = start.index_copy(0, doubted.which, plain.pose)
     here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
-    first = usual_scale(doubted, plain.gain, SLIP), compared(doubted, variance, seen, any_scale(doubted))[1]
+    usual = usual_scale(doubted, plain.gain, SLIP)
+    first = usual, trust(compared(doubted, variance, seen, any_scale(doubted))[1])
     best, (least, fits) = plain, cost(doubted, plain, plain.gain)
     least, brightest = CLEARLY_LESS * least, BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
     trials: list[tuple[Tensor, tuple[Scale, Tensor] | None]] = [(there, first), (start, None), (there, None)]
+    remembered = is_cpu(start.device) and bool((doubted.last < 1).any())
+    if remembered:
+        trials.insert(0, (start, (usual, doubted.last)))
     for place, begin in trials if is_cpu(start.device) else trials[:1]:  # elsewhere all templates would go through all
-        found = reweighted(doubted, place, begin or median_look(doubted, place))
+        found = reweighted(doubted, place, *(begin or median_look(doubted, place)))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
         better = torch.where(well == fits, price < least, well)  # what fits most of it, or else what leaves less
         better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
         best, recognised = chosen(better, found, best), recognised & ~better
+        if remembered:  # a cover mostly stays: what has led here in the last frame, and does so again, is enough
+            recognised, remembered = recognised | better & covers_most(found), False
         least, fits = torch.where(better, price, least), torch.where(better, well, fits)
         if is_cpu(start.device) and bool((fits | recognised).all()):
             break
@@ -170,16 +198,17 @@ def cost(doubted: Doubted, found: Solution, gain: Tensor) -> tuple[Tensor, Tenso
 
 
 def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:
-    """Scale and excess (n, blocks) under a median fit at ``place`` (B, 3)."""
+    """Scale and trust (n, blocks) under a median fit at ``place`` (B, 3)."""
     look = doubted.solve(place, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
     variance, gain = median_fit(look.sums, doubted.blocks)
-    return compared(doubted, variance, look.sums[:, 0], usual_scale(doubted, gain[:, 0], FIRST_SLIP))
+    scale, ratio = compared(doubted, variance, look.sums[:, 0], usual_scale(doubted, gain[:, 0], FIRST_SLIP))
+    return scale, trust(ratio)
 
 
-def reweighted(doubted: Doubted, place: Tensor, first: tuple[Scale, Tensor]) -> Solution:
-    """Solved from their ``place`` (B, 3) on, with trust that begins with the ``first`` scale and excess and settles."""
-    blocks, (scale, ratio) = doubted.blocks, first
-    after = trust(ratio)
+def reweighted(doubted: Doubted, place: Tensor, scale: Scale, after: Tensor) -> Solution:
+    """Solved from their ``place`` (B, 3) on, with trust that begins as ``after`` (n, blocks) a look of that ``scale``
+    and settles."""
+    blocks = doubted.blocks
     for _ in range(ROUNDS if is_cpu(place.device) else FEW_ROUNDS):
         before = after
         found = doubted.solve(place, doubted.settings, before)

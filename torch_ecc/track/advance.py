@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 
+from torch_ecc.core.align import solve_again
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
+from torch_ecc.core.reference import Reference
+from torch_ecc.core.robust import Memory
+from torch_ecc.core.settings import Settings
 from torch_ecc.track.budget import BURST
 
 PREDICTIONS = ("hold", "velocity")
@@ -36,6 +40,22 @@ def beginning(start: Tensor) -> dict[str, Tensor]:
         "turn": none[0].clone(),  # (): which of many lost ones is searched for next
         "credit": start.new_tensor(BURST),  # (): for searches, in frames, see ``budget``
     }
+
+
+def remembering(state: State, image: Tensor, settings: Settings) -> Callable[[Reference, Tensor], Estimate]:
+    """How templates are found in an ``image``, from poses (R, 3) on, with what is known of them; what of them is
+    believed where there is a pose, is what the next look begins with."""
+    memory = Memory(state["score"], state["trust"])
+
+    def look(reference: Reference, pose: Tensor) -> Estimate:
+        estimate, trust = solve_again(reference, image, pose, settings, state["start"], memory)
+        if trust is None:
+            state["trust"].fill_(1)
+        else:
+            state["trust"].copy_(torch.where(Status.good(estimate.status)[:, None], trust, 1.0))
+        return estimate
+
+    return look
 
 
 def advanced(state: State, estimate: Estimate) -> Estimate:

@@ -14,11 +14,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.core.align import solve
+from torch_ecc.core.align import solve, solve_again
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
 from torch_ecc.core.reference import Reference
+from torch_ecc.core.robust import Memory
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
 from torch_ecc.core.verdict import expected_score, just_as_good, noise_share, unknown, within_margin
@@ -97,7 +98,9 @@ def from_rest(reference: Reference, image: Tensor, estimate: Estimate, past: Pas
     if len(index) == 0:
         return estimate
     view = image if len(image) == 1 else image[index]
-    found = solve(reference.select(index), view, past.pose[index], settings, past.home[index], past.usual[index])
+    part = reference.select(index)
+    memory = Memory.none(part)._replace(score=past.usual[index])
+    found, _ = solve_again(part, view, past.pose[index], settings, past.home[index], memory)
     good = Status.good(found.status)
     return estimate.put(index[good], found.at(good))
 

@@ -11,7 +11,6 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from torch_ecc.core.align import solve
 from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion, named
 from torch_ecc.core.dead_lines import DeadLines
@@ -21,11 +20,11 @@ from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_pa
 from torch_ecc.core.pose import ahead
 from torch_ecc.core.pyramid import check_levels, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
+from torch_ecc.core.robust import Memory
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, seen_through
-from torch_ecc.core.verdict import expected_score
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, image_pyramid
-from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, skipped
+from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, remembering, skipped
 from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.coarse import coarse_to_fine
 from torch_ecc.track.crowd import Crowd
@@ -87,6 +86,7 @@ class Tracker(nn.Module):
     pose: Tensor
     velocity: Tensor
     score: Tensor
+    trust: Tensor
     since: Tensor
     found: Tensor
     suspect_frames: Tensor
@@ -146,7 +146,8 @@ class Tracker(nn.Module):
         for name, value in {**templates._asdict(), "first": first, **beginning(start), **past}.items():
             self.register_buffer(name, value)
         self._use(self._prepared(self._buffers))
-        self.register_buffer("score", expected_score(self.references[0]))  # the usual one, (R,)
+        for name, value in Memory.none(self.references[0])._asdict().items():
+            self.register_buffer(name, value)  # score (R,), the usual one, and trust (R, blocks)
         if self.learns:
             for name, value in Lessons.begin(self.template, self.references[0].noise.level, start).items():
                 self.register_buffer(name, value)
@@ -374,11 +375,7 @@ class Tracker(nn.Module):
             image = filled(image.float(), self.frame_mask)
             images[:] = image_pyramid(image.detach(), self.levels)
             pose = coarse_to_fine(self.references, images, pose, self.settings.max_iterations)
-        start, usual = self._buffers["start"], self._buffers["score"]
-
-        def look(reference: Reference, there: Tensor) -> Estimate:
-            return solve(reference, image, there, self.settings, start, usual)
-
+        look = remembering(self._buffers, image, self.settings)
         return self.shutter.solve(look, self.references[0], pose, self._buffers, self.settings.tolerance)
 
 
