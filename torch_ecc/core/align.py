@@ -33,7 +33,7 @@ def align(
     """
     if not isinstance(reference, Reference):
         raise ValueError(f"align: reference must come from prepare, got {type(reference).__name__}")
-    settings = Settings.of("align", options)
+    settings: Settings = settings_of("align", options)
     gray = as_image("align", "image", image)
     pose = require_tensor("align", "pose", pose)
     b, device = len(reference.K), reference.K.device
@@ -44,9 +44,15 @@ def align(
     for name, value in (("image", gray), ("pose", pose)):
         if value.device != device:
             raise ValueError(f"align: {name} must be on the reference's device {device}, got {value.device}")
-    if not (pose.is_floating_point() and bool(pose.isfinite().all())):
+    if not (pose.is_floating_point() and (torch.compiler.is_compiling() or bool(pose.isfinite().all()))):
         raise ValueError(f"align: pose must hold finite floating-point numbers, got {pose.dtype} {pose.tolist()}")
     return solve(reference, gray, pose.to(reference.place.radius.dtype), settings)
+
+
+@torch.compiler.assume_constant_result  # type: ignore[untyped-decorator]
+def settings_of(where: str, options: dict[str, str | float | bool]) -> Settings:
+    """A function's settings, a constant to torch.compile."""
+    return Settings.of(where, options)
 
 
 def solve(

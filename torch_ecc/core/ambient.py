@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import wraps
+from functools import lru_cache, wraps
 from typing import ParamSpec, TypeVar
 
 import torch
@@ -76,6 +76,35 @@ _here = threading.local()  # ``threads`` outside of ``threads_for``, None there
 def threads_of_caller() -> int:
     """As many as there are outside of ``threads_for``, for those that wait for each other asleep."""
     return getattr(_here, "threads", None) or torch.get_num_threads()
+
+
+def region(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """A part that torch.compile compiles once, however often a graph goes through it (torch 2.8 on). torch.export would
+    forget the sizes in it, and takes it as it is."""
+    mark = getattr(torch.compiler, "nested_compile_region", None)
+    if mark is None:
+        return function
+    marked: Callable[Arguments, Result] = mark(function)
+
+    @wraps(function)
+    def part(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        once = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
+        return (marked if once else function)(*args, **kwargs)
+
+    return part
+
+
+def constant(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """``lasting``, made once for the same arguments, of which there are few; part of the graph that torch.compile
+    makes."""
+    cached: Callable[..., Result] = lru_cache(maxsize=64)(lasting(function))
+
+    @wraps(function)
+    def made(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        return function(*args, **kwargs) if torch.compiler.is_compiling() else cached(*args, **kwargs)
+
+    made.cache_clear = cached.cache_clear  # type: ignore[attr-defined]
+    return made
 
 
 @contextmanager

@@ -9,12 +9,12 @@ them, and the pose is as uncertain as what one calls its place and its angle the
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import constant
 from torch_ecc.core.blocks import STRAINS, Parts
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.normal import LEAST
@@ -122,15 +122,13 @@ def _at(index: Tensor, record: Fields) -> Fields:
     return each(lambda value: value[index], record)
 
 
-@lru_cache(maxsize=16)
-@torch.inference_mode(False)
+@constant
 def _turning(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Which of ``STRAINS`` turn parts of the target, 0 or 1."""
     return torch.tensor([float(turns) for _, turns in STRAINS], dtype=dtype, device=device)
 
 
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)
+@constant
 def _lines(grid: tuple[int, int], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
     """Of a grid of blocks: which rows and columns they are in, (blocks, rows + columns); which of these are rows, and
     which columns, (rows + columns, 2); how many times that of blocks their scatter is for certain, (2,); and what makes

@@ -63,17 +63,23 @@ def as_image(where: str, name: str, image: object, device: torch.device | str | 
     if channels == 1 and dtype in KEPT:
         return image if device is None or image.device == device else image.to(device=device)
     gray = image.to(device=device, dtype=torch.float32)
-    if dtype in WIDE and not _same(gray, image):
-        raise ValueError(f"{where}: {name} must hold numbers that float32 holds exactly, got {dtype} beyond 2^24")
-    # The sum is finite exactly when all pixels are (no frame is large enough to overflow a float32 sum of grey
-    # levels), and costs a thirtieth of isfinite().all().
-    if image.is_floating_point() and not gray.sum().isfinite():
-        raise ValueError(f"{where}: {name} must be finite, got {_describe_nonfinite(gray)}")
+    if not torch.compiler.is_compiling():  # what it makes cannot look at values
+        _require_values(where, name, image, gray)
     if gray.shape[1] == 1:
         return gray
     from kornia.color import rgb_to_grayscale  # kornia takes longer to import than all the rest of this package
 
     return rgb_to_grayscale(gray[:, :3])
+
+
+def _require_values(where: str, name: str, image: Tensor, gray: Tensor) -> None:
+    """A ValueError if an ``image`` holds what its ``gray`` float32 does not, or what is no number."""
+    if image.dtype in WIDE and not _same(gray, image):
+        raise ValueError(f"{where}: {name} must hold numbers that float32 holds exactly, got {image.dtype} beyond 2^24")
+    # The sum is finite exactly when all pixels are (no frame is large enough to overflow a float32 sum of grey
+    # levels), and costs a thirtieth of isfinite().all().
+    if image.is_floating_point() and not gray.sum().isfinite():
+        raise ValueError(f"{where}: {name} must be finite, got {_describe_nonfinite(gray)}")
 
 
 def _same(gray: Tensor, image: Tensor) -> bool:

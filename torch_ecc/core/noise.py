@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_ecc.core.ambient import lasting
 from torch_ecc.core.criteria import centred
 from torch_ecc.core.pose import pose_dtype
-from torch_ecc.core.sampling import blur, gradients, noise_level
+from torch_ecc.core.sampling import blur, noise_level
 
 INSTRUMENT_BLUR = 0.9  # px; 0.7 to 1 serve alike
 NEARBY = 4.0  # px: Gaussian window in which the texture of a template is told from its noise
 CERTAIN = 1.3  # times the noise's power in that window: by chance alone it is not more
+# Of the x derivative of white noise of unit variance: raw times blurred by INSTRUMENT_BLUR, and blurred squared.
+NOISE_RESPONSE = (0.176801398, 0.055585362)
 LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
 
 
@@ -59,19 +59,9 @@ def wiener_weight(gradient: Tensor, noise: Tensor) -> Tensor:
     may vary from pixel to pixel, (B, 1, h, w).
     """
     noise = noise.view(-1, 1, 1, 1) if noise.dim() == 1 else noise
-    floor = 2 * noise_response()[1] * noise.to(gradient.dtype).square()
+    floor = 2 * NOISE_RESPONSE[1] * noise.to(gradient.dtype).square()
     power = (blur(gradient.square().sum(1, keepdim=True), NEARBY) - CERTAIN * floor).clamp(min=0)
     return power / (power + floor / 2).clamp(min=1e-30)
-
-
-@lru_cache(maxsize=1)
-@lasting
-def noise_response() -> tuple[float, float]:
-    """Of the x derivative of white noise of unit variance: raw times blurred, and blurred squared, on average."""
-    impulse = torch.zeros(1, 1, 33, 33, dtype=torch.float32, device="cpu")
-    impulse[..., 16, 16] = 1.0
-    raw, blurred = gradients(impulse)[:, 0], gradients(blur(impulse, INSTRUMENT_BLUR))[:, 0]
-    return float((raw * blurred).sum()), float((blurred * blurred).sum())
 
 
 def errors_in_variables(sums: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.criteria import inverse_where, safe_inverse
-from torch_ecc.core.noise import errors_in_variables, largest_eigenvalue, noise_response
+from torch_ecc.core.noise import NOISE_RESPONSE, errors_in_variables, largest_eigenvalue
 
 LEAST = 1e-30  # what is divided by is at least so much
 
@@ -59,7 +59,7 @@ def normal_equations(sums: Moments) -> Normal:
     spread = rows @ sums.power @ rows.mT
     bread = torch.where(regular[:, None, None], inverse_where(regular, block), 0.0)
     bread_bias, meat_bias = (
-        errors_in_variables(q) * response for q, response in zip(sums.noise.unbind(1), noise_response(), strict=True)
+        errors_in_variables(q) * response for q, response in zip(sums.noise.unbind(1), NOISE_RESPONSE, strict=True)
     )
     total, along, count = sums.gram[:, 0, 0], sums.gram[:, 0, 3], sums.number.clamp(min=1)
     return Normal(

@@ -15,12 +15,13 @@ Conventions of the whole package, written here once:
 
 from __future__ import annotations
 
-from functools import lru_cache
 from math import tau
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+from torch_ecc.core.ambient import constant
 
 if TYPE_CHECKING:
     from kornia.geometry.liegroup import Se2
@@ -127,8 +128,7 @@ def from_se2(se2: Se2) -> Tensor:
     return from_matrix(se2.matrix())
 
 
-@lru_cache(maxsize=16)
-@torch.inference_mode(False)  # what a cache keeps must serve outside inference mode too
+@constant
 def _turn(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """The constant part (9,) of ``turn``, and what cosine and sine are multiplied with (2, 9)."""
     still = torch.tensor([0, 0, 0, 0, 0, 0, 0, 0, 1], dtype=dtype, device=device)

@@ -132,16 +132,24 @@ class Reference(_Groups):
         """The light columns' coordinates: pixel positions in ``Place.unit``, (B, 2, N)."""
         return self.place.unit @ self.grid.pixels
 
-    @cached_property
-    @lasting
+    @property
     def blocks(self) -> Blocks:
         """What the template has in each block, made once for as long as the reference lives."""
+        return blocks_of(self) if torch.compiler.is_compiling() else self._kept_blocks
+
+    @property
+    def parts(self) -> Parts:
+        """What each block adds to the normal equations: made once, if it is needed."""
+        return parts_of(self) if torch.compiler.is_compiling() else self._kept_parts
+
+    @cached_property
+    @lasting
+    def _kept_blocks(self) -> Blocks:
         return blocks_of(self)
 
     @cached_property
     @lasting
-    def parts(self) -> Parts:
-        """What each block adds to the normal equations: made once, if it is needed."""
+    def _kept_parts(self) -> Parts:
         return parts_of(self)
 
     @cached_property

@@ -7,7 +7,7 @@ pixel centres at integers, and a warp is a 2x3 matrix that takes homogeneous tem
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, reduce
+from functools import reduce
 from itertools import cycle
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_ecc.core.ambient import lasting
+from torch_ecc.core.ambient import constant
 from torch_ecc.core.pose import pose_dtype
 
 MARGIN_KEPT = 3  # px: a window serves until a patch comes nearer to its border
@@ -115,7 +115,8 @@ class Sampler(NamedTuple):
         return slopes if self.kernel.ring else slopes * self._scale().to(slopes.dtype)
 
     def _scale(self) -> Tensor:
-        return _to_unit(*self.values.shape[-2:], self.values.device)
+        h, w = self.values.shape[-2:]
+        return _to_unit(h, w, self.values.device)
 
     def _points(self, warp: Tensor, pixels: Tensor) -> Tensor:
         """Where (B, 2, N) the ``warp`` takes ``pixels``: px from value (0, 0); without prefilter, where no more is done
@@ -158,11 +159,12 @@ class Sampler(NamedTuple):
 
 
 def is_cpu(device: torch.device) -> bool:
-    """Whether the host may look at values in the midst of a solve: that costs a CPU nothing and stops an accelerator.
+    """Whether the host may look at values in the midst of a solve: that costs a CPU nothing, stops an accelerator, and
+    what torch.compile makes cannot.
 
     It decides nothing but what is left undone: iterations after convergence, pixels of the frame far from a template.
     """
-    return device.type == "cpu"
+    return device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 def make_sampler(interpolation: str, image: Tensor, warp: Tensor, box: Tensor, last: Sampler | None = None) -> Sampler:
@@ -209,8 +211,7 @@ def _mirror(index: Tensor, size: int) -> Tensor:
     return torch.minimum(index, period - index)
 
 
-@lru_cache(maxsize=64)
-@lasting
+@constant
 def _to_unit(h: int, w: int, device: torch.device) -> Tensor:
     """What takes px from the first pixel to grid_sample's coordinates plus 1, which end at 2: (2, 1)."""
     ends = [[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]]
@@ -231,8 +232,7 @@ def _sum(values: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
     return reduce(lambda total, pair: total.addcmul_(*pair), zip(values[1:], weights[1:], strict=True), values[0])
 
 
-@lru_cache(maxsize=64)
-@lasting
+@constant
 def _band(n: int, taps: tuple[float, ...], sign: int, device: torch.device) -> Tensor:
     """Filter with ``taps`` at 0, 1, 2 ... px, odd about 0 for a ``sign`` of -1, mirrored at the border: (n, n)."""
     index = torch.arange(n, device="cpu")
@@ -246,23 +246,37 @@ def prefilter(image: Tensor, interpolation: str, ring: int = 0) -> Tensor:
     """Coefficients of the interpolating B-spline of ``image`` (..., H, W), mirrored at its border (Unser, 1993), and
     ``ring`` more on every side, which repeat those inside: (..., H + 2 ring, W + 2 ring).
 
-    Two products with a dense inverse: exact, and faster than a recursion, blocks or a 25-tap convolution in torch.
+    Two products with a dense inverse: exact, and faster than a recursion, blocks or a 25-tap convolution in torch. To
+    torch.compile it is one operator, so that the inverse is made once and no part of a graph.
     """
+    if torch.compiler.is_compiling():
+        compiled: Tensor = torch.ops.torch_ecc.prefilter(image, interpolation, ring)
+        return compiled
     taps, like = SAMPLERS[interpolation].taps, (image.dtype, image.device)
     rows, columns = (_prefilter_matrix(n, taps, ring, *like) for n in image.shape[-2:])
     return rows @ image @ columns.mT
 
 
-@lru_cache(maxsize=64)
-@lasting
+_operators = torch.library.Library("torch_ecc", "FRAGMENT")
+_operators.define("prefilter(Tensor image, str interpolation, int ring) -> Tensor")
+_operators.impl("prefilter", prefilter, "CompositeExplicitAutograd")
+
+
+def _prefilter_shape(image: Tensor, _: str, ring: int) -> Tensor:
+    return image.new_empty((*image.shape[:-2], *(n + 2 * ring for n in image.shape[-2:])))
+
+
+torch.library.register_fake("torch_ecc::prefilter", _prefilter_shape, lib=_operators)
+
+
+@constant
 def _prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     inverse = torch.linalg.inv(_band(n, taps, 1, torch.device("cpu")))
     extended: Tensor = inverse[_mirror(torch.arange(-ring, n + ring, device="cpu"), n)]
     return extended.to(device, dtype)
 
 
-@lru_cache(maxsize=64)
-@lasting
+@constant
 def _slope_matrix(n: int, device: torch.device) -> Tensor:
     cpu = torch.device("cpu")
     slope: Tensor = _band(n, SLOPE, -1, cpu) @ torch.linalg.inv(_band(n, SAMPLERS["bspline3"].taps, 1, cpu))
@@ -284,8 +298,7 @@ def aliasing(image: Tensor, interpolation: str) -> Tensor:
     return torch.cat((image @ columns.mT, rows @ image), 1)
 
 
-@lru_cache(maxsize=64)
-@lasting
+@constant
 def _alias(n: int, interpolation: str, device: torch.device) -> Tensor:
     """Samples of a signal to the error in them after it was sampled a quarter px off and interpolated back, (n, n)."""
     exact = _quarter(n, "bspline5")

@@ -18,7 +18,8 @@ FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 
 
 class Trust(NamedTuple):
-    """Of the templates at ``which`` (n,): by how much the pixels of their ``blocks`` (n, blocks) count, 0 to 1."""
+    """Of the templates at ``which`` (n,): by how much the pixels of their ``blocks`` (n, blocks) count, 0 to 1. Where
+    the host does not look that is all of them, in their order."""
 
     which: Tensor
     blocks: Tensor

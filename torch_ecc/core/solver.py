@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import region
 from torch_ecc.core.pose import retract
 from torch_ecc.core.reference import Reference, each, restrict, reweigh
 from torch_ecc.core.sampling import Sampler, inside, is_cpu, make_sampler
@@ -49,9 +50,9 @@ def solve(
 ) -> Solution:
     """Poses of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on, or of those that a ``trust`` is about; on a
     CPU in chunks that fit its cache."""
-    image, blocks = image.to(reference.K.dtype), None
-    if trust is not None:
-        blocks, reference, start = trust.blocks, reference.select(trust.which), start[trust.which]
+    image, blocks = image.to(reference.K.dtype), None if trust is None else trust.blocks
+    if trust is not None and is_cpu(start.device):
+        reference, start = reference.select(trust.which), start[trust.which]
         image = image if len(image) == 1 else image[trust.which]
     many = len(start)
     some = max(PIXELS_AT_ONCE * torch.get_num_threads() // reference.K.shape[-1], 1) if is_cpu(start.device) else many
@@ -94,26 +95,43 @@ def iterate(
 
     An accelerator does them all, so that the host need not know: what has converged is masked.
     """
-    size, on_cpu = (image.shape[-2], image.shape[-1]), is_cpu(image.device)
+    on_cpu, warp = is_cpu(image.device), reference.warps(state.pose)
     state = state._replace(error=torch.full_like(state.error, inf))
-    warp, g, sample, visible = None, torch.zeros_like(reference.weight), None, None
+    sample = make_sampler(interpolation, image, warp, reference.grid.box)
+    g, visible = torch.zeros_like(reference.weight), None
     for _ in range(most):
         busy = (state.error > tolerance) & (state.iterations < most)
         if on_cpu and not busy.any():
             break
-        there = reference.warps(state.pose)
-        warp = there if warp is None else torch.where(busy[:, None, None], there, warp)  # else as it was last seen
+        warp = torch.where(busy[:, None, None], reference.warps(state.pose), warp)  # else as it was last seen
         sample = make_sampler(interpolation, image, warp, reference.grid.box, sample)
-        g = sample_patch(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
-        whole = on_cpu and inside(warp, reference.grid.box, size).all()
-        visible = None if whole else inside(warp, reference.grid.pixels, size)
-        counted = counted_pixels(reference, visible, trusted)
-        seen = reference if counted is None else restrict(reference, counted)
-        increment = seen.criterion.step(seen, g).to(state.pose.dtype)  # eq. (9)
-        if counted is not None:
-            increment = torch.where(seen.weight.any(1, keepdim=True), increment, torch.nan)  # nothing in sight: no step
-        state = advance(state, increment, reference.place.lever, busy)
+        state, g, visible = iteration(
+            reference, sample, state, warp, g, busy, trusted, (image.shape[-2], image.shape[-1])
+        )
     return state, g, visible
+
+
+@region
+def iteration(
+    reference: Reference,
+    sample: Sampler,
+    state: State,
+    warp: Tensor,
+    g: Tensor,
+    busy: Tensor,
+    trusted: Tensor | None,
+    size: tuple[int, int],
+) -> tuple[State, Tensor, Tensor | None]:
+    """One of them, of templates that are ``busy`` (B,) and seen in the ``warp`` (B, 2, 3) of a frame of ``size``."""
+    g = sample_patch(sample, warp, reference.grid.pixels, g, busy)  # I(W(p_k; x'))
+    whole = is_cpu(warp.device) and inside(warp, reference.grid.box, size).all()
+    visible = None if whole else inside(warp, reference.grid.pixels, size)
+    counted = counted_pixels(reference, visible, trusted)
+    seen = reference if counted is None else restrict(reference, counted)
+    increment = seen.criterion.step(seen, g).to(state.pose.dtype)  # eq. (9)
+    if counted is not None:
+        increment = torch.where(seen.weight.any(1, keepdim=True), increment, torch.nan)  # nothing in sight: no step
+    return advance(state, increment, reference.place.lever, busy), g, visible
 
 
 def sample_patch(sample: Sampler, warp: Tensor, pixels: Tensor, last: Tensor, busy: Tensor) -> Tensor:

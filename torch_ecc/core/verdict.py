@@ -5,13 +5,13 @@ It is made for every frame, of few numbers: what can be known before is, and on 
 
 from __future__ import annotations
 
-from functools import lru_cache
 from math import inf
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from torch_ecc.core.ambient import constant
 from torch_ecc.core.clinging import clinging
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.estimate import Estimate, Reason, Status
@@ -118,8 +118,7 @@ def without_contrast(reference: Reference, found: Solution) -> Tensor:
     return flat
 
 
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)
+@constant
 def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Which way each amount counts, and how much it has to be at least, (8,) each."""
     least = settings.min_visible, settings.min_score, torch.finfo(dtype).tiny, LEAST_COVERAGE
@@ -129,8 +128,7 @@ def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tup
     return sign, limit
 
 
-@lru_cache(maxsize=16)
-@torch.inference_mode(False)
+@constant
 def _codes(column: int, device: torch.device) -> Tensor:
     """Of ``VERDICTS``: (8,) int8."""
     return torch.tensor([int(verdict[column]) for verdict in VERDICTS], dtype=torch.int8, device=device)
@@ -254,14 +252,12 @@ def unknown(covariance: Tensor) -> Tensor:
     return _infinite(covariance.dtype, covariance.device)
 
 
-@lru_cache(maxsize=16)
-@torch.inference_mode(False)
+@constant
 def _infinite(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.diag(torch.full((3,), inf, dtype=dtype, device=device))
 
 
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)
+@constant
 def _zeros(count: int, device: torch.device) -> Tensor:
     """The codes (B,) of poses that no search has given, and that nothing speaks against."""
     return torch.zeros(count, dtype=torch.int8, device=device)

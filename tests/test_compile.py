@@ -1,0 +1,78 @@
+"""torch.compile and torch.export take the page as one graph, without a break, and their poses are those of the page.
+
+The graphs are run without a code generator: what they hold is the matter here (``benchmarks/accelerator.py`` times the
+generated code).
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_accelerator import problem
+from torch import Tensor, nn
+
+import torch_ecc as te
+from torch_ecc.core.sampling import prefilter
+
+FEW = {"max_iterations": 2, "backend": "torch"}  # tracing takes its time
+
+
+@pytest.fixture
+def blindly(request: pytest.FixtureRequest):
+    """``te.align`` as where the host looks at nothing."""
+
+    def align(*args, **options) -> te.Estimate:
+        request.getfixturevalue("blind")
+        return te.align(*args, **options)
+
+    return align
+
+
+def assert_same(came, wanted: te.Estimate) -> None:
+    """To 1e-6 px; codes equal, and all else to rounding."""
+    for a, b in zip(came, wanted, strict=True):
+        assert a.dtype == b.dtype
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6 if a is came[0] else 1e-5, equal_nan=True)
+
+
+def test_align_is_one_graph(blindly):
+    """Robust as it is by default."""
+    templates, images, start = problem(0)
+    reference, options = te.prepare(templates), FEW | {"max_iterations": 1}
+    compiled = torch.compile(te.align, backend="aot_eager", fullgraph=True, dynamic=False)
+    came = compiled(reference, images, start, **options)
+    _, others, begin = problem(3)
+    again = compiled(reference, others, begin, **options)
+    assert_same(came, blindly(reference, images, start, **options))
+    assert_same(again, blindly(reference, others, begin, **options))
+
+
+class Step(nn.Module):
+    """A frame and poses to the next poses and their statuses."""
+
+    def __init__(self, reference: te.Reference) -> None:
+        super().__init__()
+        self.reference = reference
+
+    def forward(self, frame: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        estimate = te.align(self.reference, frame, pose, robust=False, **FEW)
+        return estimate.pose, estimate.status
+
+
+def test_a_step_is_exported(blindly):
+    """With fixed sizes."""
+    templates, images, start = problem(0)
+    reference = te.prepare(templates)
+    program = torch.export.export(Step(reference), (images, start))
+    _, others, begin = problem(3)
+    pose, status = program.module()(others, begin)
+    wanted = blindly(reference, others, begin, robust=False, **FEW)
+    assert (pose - wanted.pose).abs().max() < 1e-6
+    assert torch.equal(status, wanted.status)
+
+
+def test_the_prefilter_is_an_operator():
+    """Its schema, its shapes and its values."""
+    image = torch.randn(2, 1, 20, 30)
+    torch.library.opcheck(torch.ops.torch_ecc.prefilter, (image, "bspline3", 1))
+    assert torch.equal(torch.ops.torch_ecc.prefilter(image, "bspline5", 2), prefilter(image, "bspline5", 2))
