@@ -166,11 +166,11 @@ def _rates(frames: list[Tensor], centers: Tensor) -> tuple[float, float, float]:
     """Frames per second, medians, of the patches with their body, without, and of OpenCV's ECC in a loop; in turns."""
     with_body, without = (te.Tracker(frames[0], centers, 51) for _ in range(2))
     body = te.Body(with_body)
-    peers = [rivals()["OpenCV ECC, fastest fair"].start(frames[0], (x, y), 51) for x, y in centers.tolist()]
+    peers = [rivals()["OpenCV ECC, fastest fair"].start(frames[0][None], (x, y), 51) for x, y in centers.tolist()]
     calls: tuple[Callable[[Tensor], object], ...] = (
         lambda frame: body(with_body(frame)),
         without,
-        lambda frame: [one(frame) for one in peers],
+        lambda frame: [one(frame[None]) for one in peers],
     )
     taken: list[list[float]] = [[], [], []]
     for frame in frames[1:]:

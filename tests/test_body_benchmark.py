@@ -23,7 +23,7 @@ PLAN = rigid.Plan(side=420, across=4, size=41, span=290)
 
 
 def test_bodies_are_at_the_bound_of_all_patches_and_honest():
-    found = rigid.draw(PLAN, 2.0, 30)
+    found = rigid.draw(PLAN, 2.0, 25)
     assert (rms(found.error) / PLAN.bound(2.0) < 1.5).all()
     assert 0.5 < found.nees.mean() < 1.5
     assert 0.7 < found.chi2.mean() < 1.3
@@ -32,12 +32,12 @@ def test_bodies_are_at_the_bound_of_all_patches_and_honest():
 
 @pytest.mark.parametrize("wrong", ["covered", "jumped", "another body"])
 def test_five_of_sixteen_that_are_wrong_are_named(wrong):
-    found = rigid.draw(PLAN, 2.0, 6, wrong, body.APART)
+    found = rigid.draw(PLAN, 2.0, 4, wrong, body.APART)
     left = torch.ones(16, dtype=torch.bool)
     left[list(body.APART)] = False
     assert not found.used[:, ~left].any()
     assert found.used[:, left].double().mean() > 0.95
-    assert (rms(found.error) / PLAN.bound(2.0, left) < 2.2).all()
+    assert (rms(found.error) / PLAN.bound(2.0, left) < 2.5).all()
 
 
 def test_frames_drawn_near_patches_are_the_cameras_own():
@@ -57,8 +57,8 @@ def test_frames_drawn_near_patches_are_the_cameras_own():
 
 def test_a_lens_that_was_self_calibrated_is_as_good_as_the_known_one():
     lens = Lens((209.5, 209.5), math.hypot(419, 419) / 2, 0.005)
-    plan = rigid.Plan(side=420, across=3, size=41, span=160)
-    angle = math.tau * torch.arange(5, dtype=torch.float64) / 5
+    plan = rigid.Plan(side=420, across=3, size=31, span=160)
+    angle = math.tau * torch.arange(4, dtype=torch.float64) / 4
     path = torch.stack((80 * angle.cos(), 80 * angle.sin(), 0.05 * (2 * angle).sin()), 1) + plan.middle
     tracker, track = body._followed(plan, lens, path)
     fit = body.te.calibrate(track, tracker=tracker, lens=["k1"])

@@ -90,8 +90,7 @@ def fuse(pose: Tensor, covariance: Tensor, good: Tensor, layout: Layout) -> Fusi
                 at = some[:, None], members
                 weight[at], found.pose[some, g] = consensus(Patches(*(v[at] for v in patches)), own)
         found = fitted(patches._replace(weight=weight), layout, found.pose, 1)
-    turns = middle(layout.bodies(patches.pose), patches.weight, layout)[..., 2]
-    theta = unwrap(found.pose[..., 2], turns)
+    theta = unwrap(found.pose[..., 2], start[..., 2])
     return found._replace(pose=torch.cat((found.pose[..., :2], theta[..., None]), -1))
 
 
