@@ -45,10 +45,11 @@ def clinging(reference: Reference, found: Solution, variance: Tensor, of_both: T
     free = occupied / (occupied - columns)  # blocks are not free: the fit has made their sum zero
     white, grid = found.normal.white * of_both.unsqueeze(1), reference.grid.blocks
     scatter = torch.maximum(found.total[:, 10:].div(white).mul_(free), variance.unsqueeze(1))
-    certain = in_lines(found.sums[:, 7:], white, scatter, grid)[1].flatten(1).any(1)
+    certain = in_lines(found.sums[:, 7:], white, scatter, grid)[1]
     on_cpu = is_cpu(certain.device)
     if on_cpu and not bool(certain.any()):
         return Clinging(scatter, None)
+    certain = certain.flatten(1).any(1)
     index = certain.nonzero()[:, 0] if on_cpu else torch.arange(len(certain), device=certain.device)
     effect, strained = without_strain(_at(index, reference.parts), _at(index, found))
     certain, white = certain[index], white[index]

@@ -90,7 +90,8 @@ def ahead(pose: Tensor, step: Tensor) -> Tensor:
 
     W(pose) o W(last)^-1 o W(pose), exact for a constant turn about any point: the step turns by its own angle.
     """
-    return pose + (turn(step[..., 2]) @ step.unsqueeze(-1)).squeeze(-1)
+    turned = torch.bmm(turn(step[..., 2]).view(-1, 3, 3), step.reshape(-1, 3, 1))
+    return pose + turned.view(step.shape)
 
 
 def unwrap(theta: Tensor, reference: Tensor) -> Tensor:
