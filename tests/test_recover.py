@@ -332,14 +332,14 @@ def test_searches_take_no_more_than_their_share(monkeypatch):
     without a bound as often as ever. Who waits is told why."""
     searched: list[int] = []
     monkeypatch.setattr(
-        Recovery, "search_anywhere", lambda self, i, e, p, r: (searched.append(r), self.budget.spend(10**7), e)[2]
+        Recovery, "search_anywhere", lambda self, i, e, p, r: (searched.append(r), self.budget.spend(10**7, 0), e)[2]
     )
     stack = still((0, 0, 0), start=(160.0, 120.0, 0.0))
     counts = {}
     for share in (0.1, 0.5, 1.0):
         searched.clear()
         tracker = Tracker(stack[0], [(160.0, 120.0)], 31, search_share=share)
-        reasons = [int(tracker(torch.full_like(stack[0], 90)).reason) for _ in range(300)]
+        reasons = [int(tracker(torch.full_like(stack[0], 90)).reason) for _ in range(400)]
         counts[share] = len(searched)
         assert (te.Reason.WAITING in reasons) == (share < 1)
     assert counts[0.1] < counts[0.5] < counts[1.0]

@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
     from torch_ecc.records.lens import Lens
     from torch_ecc.search.locate import Located, Locator, locate
     from torch_ecc.track.frame_mask import suggest_frame_mask
+    from torch_ecc.track.own_mask import suggest_mask
     from torch_ecc.track.stabilise import stabilise
     from torch_ecc.track.tracker import SequenceError, Tracker
 
@@ -50,6 +51,7 @@ _PLACES = {
     "records.lens": ["Lens"],
     "search.locate": ["Located", "Locator", "locate"],
     "track.frame_mask": ["suggest_frame_mask"],
+    "track.own_mask": ["suggest_mask"],
     "track.stabilise": ["stabilise"],
     "track.tracker": ["SequenceError", "Tracker"],
 }
@@ -89,6 +91,7 @@ __all__ = [
     "rotation_centre",
     "stabilise",
     "suggest_frame_mask",
+    "suggest_mask",
     "texture",
     "texture_map",
 ]

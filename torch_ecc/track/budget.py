@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-BURST = 1000.0  # frames of credit at most, and at first
+BURST = 3000.0  # frames of credit at most, and at first
 SOLVE = 20  # times the pixels of a template: its solve
 CORRELATION = 4  # times the pixels of a spectrum, for every angle
 
@@ -24,9 +24,9 @@ class Budget:
         """Whether there is any credit, which is BURST at most."""
         return float(self.credit.clamp_(max=BURST)) > 0
 
-    def spend(self, spectra: int) -> None:
-        """On correlations with ``spectra`` values."""
-        self.credit.sub_(CORRELATION * spectra / self.frame)
+    def spend(self, spectra: int, aligned: int) -> None:
+        """On correlations with ``spectra`` values, and what it takes to align what they show, in pixels."""
+        self.credit.sub_((CORRELATION * spectra + aligned) / self.frame)
 
     def in_turn(self, due: list[int], served: int) -> list[int]:
         """Those ``due`` in the order in which it is their turn, if no more than so many are ``served`` at once."""

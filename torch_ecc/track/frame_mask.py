@@ -71,11 +71,7 @@ def suggest_frame_mask(frames: Iterable[Tensor], track: Track, size: Size) -> Te
     that they are told from: track again with the mask, and ask once more. ValueError for what does not fit.
     """
     sides = as_size("suggest_frame_mask", size)
-    if track.pose.dim() != 3:
-        raise ValueError(f"suggest_frame_mask: track must be (F, R, ...), got {tuple(track.pose.shape)}")
-    count = len(track.pose)
-    some = torch.linspace(0, count - 1, min(MOST, count), device=track.pose.device).round().long()
-    looks = _kept(frames, some.tolist(), count).to(track.pose.device)
+    some, looks = chosen_frames("suggest_frame_mask", frames, track)
     shown = torch.ones(looks.shape[2:], dtype=torch.bool, device=looks.device)
     for r in range(track.pose.shape[1]):
         good = Status.good(track.status[some, r])
@@ -86,19 +82,23 @@ def suggest_frame_mask(frames: Iterable[Tensor], track: Track, size: Size) -> Te
     return shown
 
 
-def _kept(frames: Iterable[Tensor], wanted: list[int], count: int) -> Tensor:
-    """The frames of these numbers of ``count``, grey: (K, 1, H, W)."""
-    kept: list[Tensor] = []
-    done = 0
+def chosen_frames(where: str, frames: Iterable[Tensor], track: Track) -> tuple[Tensor, Tensor]:
+    """The numbers (K,) of MOST frames evenly spread over a ``track`` (F, R, ...), and the frames, grey: (K, 1, H, W).
+    ValueError, which names ``where``, for frames that are not those of the track."""
+    if track.pose.dim() != 3:
+        raise ValueError(f"{where}: track must be (F, R, ...), got {tuple(track.pose.shape)}")
+    count = len(track.pose)
+    some = torch.linspace(0, count - 1, min(MOST, count), device=track.pose.device).round().long()
+    wanted, kept, done = set(some.tolist()), [], 0
     for frame in frames:
         if done in wanted:
-            kept.append(as_gray("suggest_frame_mask", f"frame {done}", frame))
+            kept.append(as_gray(where, f"frame {done}", frame))
             if kept[-1].shape != kept[0].shape or len(kept[0]) != 1:
-                raise ValueError(f"suggest_frame_mask: frame {done} must be one of the first one's size")
+                raise ValueError(f"{where}: frame {done} must be one of the first one's size")
         done += 1
     if done != count:
-        raise ValueError(f"suggest_frame_mask: frames must be {count}, as many as the track has, got {done}")
-    return torch.cat(kept)
+        raise ValueError(f"{where}: frames must be {count}, as many as the track has, got {done}")
+    return some, torch.cat(kept).to(track.pose.device)
 
 
 def _around(pose: Tensor, size: tuple[int, int]) -> tuple[slice, slice]:
@@ -134,14 +134,14 @@ def _misfit(views: Views, patches: Tensor, shown: Tensor) -> tuple[Tensor, Tenso
     height, width = shown.shape
     x, y = (views.there @ views.template.to(views.there.dtype)).round().long().unbind(1)
     seen = shown[y.clamp(0, height - 1), x.clamp(0, width - 1)] & inside(views.there, views.template, shown.shape)
-    scene = _median(torch.where(seen, patches, torch.nan))
+    scene = median(torch.where(seen, patches, torch.nan))
     expected = Sampler.of(scene.view(1, 1, *views.size))(views.back, views.frame).view(-1, height, width)
     expected = torch.where(views.crossed, expected, torch.nan)
-    left = _unexplained(views.image[:, 0], torch.where(shown, expected, torch.nan), expected)
-    return _median(left.abs()), scene[scene.isfinite()].std()
+    left = unexplained(views.image[:, 0], torch.where(shown, expected, torch.nan), expected)
+    return median(left.abs()), scene[scene.isfinite()].std()
 
 
-def _unexplained(image: Tensor, known: Tensor, expected: Tensor) -> Tensor:
+def unexplained(image: Tensor, known: Tensor, expected: Tensor) -> Tensor:
     """What is left of an ``image`` (K, H, W) that is ``expected`` to be something else, after each frame's gain and
     offset: those of most pixels where that is ``known``, by iteratively re-weighted least squares (Cauchy)."""
     e, g = known.flatten(1), image.flatten(1)
@@ -159,7 +159,7 @@ def _unexplained(image: Tensor, known: Tensor, expected: Tensor) -> Tensor:
     return (g - g0 - gain * (expected.flatten(1) - e0)).view_as(image)
 
 
-def _median(values: Tensor) -> Tensor:
+def median(values: Tensor) -> Tensor:
     """Over the frames (K, ...), NaN where too few tell: (...)."""
     return torch.where(values.isfinite().sum(0) >= FEWEST, values.nanmedian(0).values, torch.nan)
 

@@ -24,7 +24,7 @@ from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
 from torch_ecc.core.verdict import expected_score, just_as_good, noise_share, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
-from torch_ecc.search.look_alikes import NEARER, LookAlikes, look_alikes_anywhere, look_alikes_near
+from torch_ecc.search.look_alikes import NEARER, REACH, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
 from torch_ecc.track.budget import Budget
 from torch_ecc.track.max_step import MaxStep
@@ -35,6 +35,8 @@ KEPT = 2**25  # complex numbers prepared for searches of the whole frame, 256 MB
 NEARBY_AT_ONCE = 64  # and near where they are expected
 PATIENCE = 16  # frames in which a lost template is searched for at every chance; later ever more seldom
 SELDOM = 16  # frames between two searches for what has been lost for long
+ALIGNED, NEARBY_ALIGNED = 20_000_000, 1_000_000  # pixels that can be read while a search aligns what it has found
+KNOWN = 0.75 * REACH  # px: look-alikes of a place found near are known if it is not farther from the last one
 NOISE_ALONE = 1.3  # times as much noise in some direction as there may be: no place can be told from the next one
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
 COARSE = (8.0, ANGLE_STEP)  # px, rad: as finely as places are told apart before they are refined
@@ -201,7 +203,7 @@ class Recovery:
         index = torch.tensor(due, device=start.device)
         view = image if len(image) == 1 else image[index]
         surroundings = self.surroundings(due)
-        self.budget.spend(surroundings.correlator.size)
+        self.budget.spend(surroundings.correlator.size, NEARBY_ALIGNED * len(due))
         found = surroundings.find(
             self.reference.select(index), view, start[index], self.settings, self.allowed(past, index)
         )
@@ -224,7 +226,7 @@ class Recovery:
     def search_anywhere(self, images: list[Tensor], estimate: Estimate, past: Past, r: int) -> Estimate:
         """Third attempt for template ``r``: anywhere in the frame, of places that look alike the nearest."""
         locator, pose = self.locator(r, (images[0].shape[-2], images[0].shape[-1])), past.pose[r]
-        self.budget.spend(locator.work)
+        self.budget.spend(locator.work, ALIGNED)
         images += image_pyramid(images[-1], locator.levels - len(images) + 1)[1:]
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
         index = torch.tensor([r], device=pose.device)
@@ -255,8 +257,10 @@ class Recovery:
         twin = torch.stack([self.near[r].nearest(found.score[r], raised[r]) for r in leapt.tolist()])
         radius = self.reference.place.radius[leapt]
         distance, moved = (pose_distance(found.pose[leapt], p[leapt], radius=radius) for p in (start, past.pose))
+        guessed = past.since[leapt] > 1  # where it is expected, which may be far from where it was last
+        distance = torch.where(guessed, torch.maximum(distance, moved), distance)
         farthest = moved + self.max_step.reach(past.since[leapt], radius)
-        doubtful = leapt[self.confusable(distance, twin, farthest)]
+        doubtful = leapt[self.confusable(distance, twin, farthest) | (guessed & (moved > KNOWN))]
         return told(found.put(doubtful, before.at(doubtful)), doubtful.tolist(), Reason.AMBIGUOUS)
 
     @staticmethod
