@@ -2,15 +2,20 @@
 
 Every iteration has to read of each pixel 4 rows of K and the frame's value, 20 bytes; so many times the pixels and the
 iterations over the measured rate of a copy is the roofline, of which the share reached is printed. The solve is the one
-of an accelerator on any device: all iterations, no look of the host at a value; a CUDA device replays it as a graph.
+of an accelerator on any device: all iterations, no look of the host at a value; eager, as what torch.compile makes of
+it, and on a CUDA device replayed as a graph. The cases come in the order of what they tell; when the ``--minutes`` are
+over those that are left are named and what was measured is written. Beside torch it needs kornia, pydantic, click and
+rich.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Some
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 import torch
@@ -20,7 +25,7 @@ from scaling import SCENE, spread
 from torch import Tensor
 
 from torch_ecc import Estimate, Tracker
-from torch_ecc.core import sampling, solver, verdict
+from torch_ecc.core import clinging, robust, sampling, solver, verdict
 from torch_ecc.core.align import solve
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
@@ -30,6 +35,7 @@ from torch_ecc.sim import Camera, Sequence
 
 FRAME = (480, 640)
 BYTES = 4 * (4 + 1)  # per pixel and iteration: float32 of the rows of K that the step needs, and of the frame
+SAMPLERS = ("bilinear", "bspline3")
 CHECKED = 16  # templates that are solved on the CPU too
 console = Console(width=110)
 Solve = Callable[[Tensor, Tensor], Estimate]
@@ -93,7 +99,7 @@ def visited(reference: Reference, settings: Settings) -> int:
 @contextmanager
 def never_looking() -> Iterator[None]:
     """Within, a CPU does what an accelerator does."""
-    modules, looks = (sampling, solver, verdict), sampling.is_cpu
+    modules, looks = (clinging, robust, sampling, solver, verdict), sampling.is_cpu
     try:
         for module in modules:
             module.is_cpu = lambda device: False
@@ -111,53 +117,113 @@ def follow(solve: Solve, images: list[Tensor], pose: Tensor) -> list[Tensor]:
     return poses[1:]
 
 
-def measure(reference: Reference, images: list[Tensor], start: Tensor, settings: Settings) -> tuple[float, float]:
-    """Poses per second, and how far at most they are from the CPU's, px or rad."""
-    some = torch.arange(min(CHECKED, len(start)), device=start.device)
+class Case(NamedTuple):
+    """What is measured: ``count`` templates of ``size`` px in a frame, by a sampler, in one of ``WAYS``."""
+
+    count: int
+    size: int
+    sampler: str
+    way: str
+    robust: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.count} of {self.size} px, {self.sampler}, {self.way}{', robust' if self.robust else ''}"
+
+
+def compiled(solve: Solve, image: Tensor, pose: Tensor) -> Solve:
+    """What torch.compile makes of ``solve``, in one graph."""
+    return torch.compile(solve, fullgraph=True, dynamic=False)
+
+
+WAYS: dict[str, Callable[[Solve, Tensor, Tensor], Solve]] = {
+    "eager": lambda solve, image, pose: solve,
+    "graph": captured,
+    "compiled": compiled,
+}
+
+
+def cases(counts: Some[int], sizes: Some[int], ways: Some[str]) -> list[Case]:
+    """The goal's first (the most templates of the largest size), then all counts and sizes, then what a robust solve
+    costs; the compiled ones last: they take minutes to make."""
+    first = [way for way in ways if way != "compiled"]
+    every = [
+        Case(n, size, sampler, way) for size in sizes[::-1] for n in counts for sampler in SAMPLERS for way in first
+    ]
+    every.sort(key=lambda case: (case.count, case.size) != (counts[-1], sizes[-1]))
+    last = [Case(counts[-1], sizes[-1], "bspline3", way) for way in ways if way == "compiled"]
+    return [*every, Case(counts[-1], sizes[-1], "bspline3", first[-1], robust=True), *last]
+
+
+def measure(case: Case, frames: list[Tensor], place: torch.device, iterations: int) -> tuple[float, float, int]:
+    """Poses per second, how far at most they are from the CPU's, px or rad, and the bytes that one has to read."""
+    first, *images = frames
+    tracker = Tracker(first, spread(case.count, case.size + 40, FRAME).round(), case.size, device=place)
+    reference, start = tracker.references[0], tracker.pose.clone()
+    settings = Settings(case.sampler, iterations, backend="torch", robust=case.robust)
+    some = torch.arange(min(CHECKED, case.count), device=place)
     near = reference.select(some).map(lambda tensor: tensor.cpu())
     exact = follow(lambda image, pose: solve(near, image, pose, settings), [i.cpu() for i in images], start[some].cpu())
     with never_looking():
-        replay = captured(lambda image, pose: solve(reference, image, pose, settings), images[0], start)
+        replay = WAYS[case.way](lambda image, pose: solve(reference, image, pose, settings), images[0], start)
         found = follow(replay, images, start)
-        taken = seconds(start.device, lambda: follow(replay, images, start), 3)
+        taken = seconds(place, lambda: follow(replay, images, start), 3)
     apart = max(float((a[some].cpu() - b).abs().max()) for a, b in zip(found, exact, strict=True))
-    return len(start) * len(images) / taken, apart
+    return case.count * len(images) / taken, apart, visited(reference, settings) * BYTES
 
 
-@torch.no_grad()
+def told(case: Case, rate: float, speed: float, apart: float, least: int) -> list[Number]:
+    """What was measured, printed."""
+    console.print(
+        f"{case}: {speed:,.0f} poses/s, {1e3 * case.count / speed:.3g} ms per frame, "
+        f"{speed * least / rate:.1%} of the roofline; {apart:.1e} px or rad from the CPU's"
+    )
+    return [
+        Number(f"{case}: poses", speed, "1/s", "higher", 0.3),
+        Number(f"{case}: share of the roofline", speed * least / rate, "", "higher", 0.3),
+        Number(f"{case}: from the CPU's poses", apart, "px"),
+    ]
+
+
+def numbers(_: click.Context, __: click.Parameter, value: str | None) -> list[int] | None:
+    """Of a list with commas."""
+    return None if value is None else [int(v) for v in value.split(",")]
+
+
 @click.command()
 @click.option("--device", default="cuda" if torch.cuda.is_available() else "cpu", show_default=True)
-@click.option("--count", type=int, help="templates in a frame [default: 4096, on a CPU 16]")
+@click.option("--counts", callback=numbers, help="templates in a frame [default: 1,64,1024,4096,16384; on a CPU 1,16]")
+@click.option("--sizes", callback=numbers, default="31,61,121", show_default=True, help="px")
 @click.option("--frames", default=10, show_default=True)
-@click.option("--size", default=121, show_default=True, help="px")
 @click.option("--iterations", default=8, show_default=True)
+@click.option("--minutes", default=7.0, show_default=True, help="begin nothing after so many")
+@click.option("--compiled/--no-compiled", default=True, show_default=True, help="what torch.compile makes of it too")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
-def main(device: str, count: int | None, frames: int, size: int, iterations: int, out: Path | None) -> None:
-    """Poses per second, share of the roofline, agreement with the CPU, by sampler."""
-    place = torch.device(device)
-    count = count or (4096 if place.type == "cuda" else 16)
-    first, *rest = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).closed(), Camera())
-    tracker = Tracker(first, spread(count, size + 40, FRAME).round(), size, device=place)
-    images, rate = [view[None].to(place) for view in rest], copy_rate(place)
-    console.print(
-        f"{place}: copies {rate / 1e9:.1f} GB/s; {count} templates of {size} px in each of {len(rest)} frames"
-    )
-    figures = [Number("copy rate", rate / 1e9, "GB/s", "higher")]
-    for sampler in ("bilinear", "bspline3"):
-        settings = Settings(sampler, iterations, backend="torch")
-        speed, apart = measure(tracker.references[0], images, tracker.pose, settings)
-        least = visited(tracker.references[0], settings) * BYTES
-        console.print(
-            f"{sampler}: {speed:,.0f} poses/s; {least / iterations / 1e3:.0f} kB per template and iteration, "
-            f"{speed * least / rate:.1%} of the roofline; {apart:.1e} px or rad from the CPU's poses"
-        )
-        figures += [
-            Number(f"{sampler}: poses", speed, "1/s", "higher", 0.3),
-            Number(f"{sampler}: share of the roofline", speed * least / rate, "", "higher", 0.3),
-            Number(f"{sampler}: from the CPU's poses", apart, "px"),
-        ]
+@torch.no_grad()
+def main(
+    device: str,
+    counts: list[int] | None,
+    sizes: list[int],
+    frames: int,
+    iterations: int,
+    minutes: float,
+    compiled: bool,
+    out: Path | None,
+) -> None:
+    """Poses per second, share of the roofline, agreement with the CPU."""
+    place, end = torch.device(device), time.monotonic() + 60 * minutes
+    counts = counts or ([1, 64, 1024, 4096, 16384] if place.type == "cuda" else [1, 16])
+    ways = ["eager", *(["graph"] if place.type == "cuda" else []), *(["compiled"] if compiled else [])]
+    shots = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).closed(), Camera())
+    views, rate = [view[None].to(place) for view in shots], copy_rate(place)
+    console.print(f"{place}: copies {rate / 1e9:.1f} GB/s; {len(views) - 1} frames, {iterations} iterations")
+    figures, left = [Number("copy rate", rate / 1e9, "GB/s", "higher")], cases(counts, sizes, ways)
+    while left and time.monotonic() < end:
+        case = left.pop(0)
+        figures += told(case, rate, *measure(case, views, place, iterations))
+    for case in left:
+        console.print(f"{case}: no time was left")
     if out:
-        save(out, figures, device=str(place), count=str(count), size=str(size), iterations=str(iterations))
+        save(out, figures, device=str(place), iterations=str(iterations))
 
 
 if __name__ == "__main__":

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import accelerator
 import pytest
 import torch
+from click.testing import CliRunner
+from results import load
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -98,3 +101,15 @@ def test_what_has_converged_stays(blind):
     few, many = (align(prepare(templates), images, start, max_iterations=n, backend="torch") for n in (15, 40))
     assert torch.equal(few.iterations, many.iterations)
     assert (few.pose - many.pose).abs().max() < 1e-9
+
+
+def test_the_benchmark_runs(tmp_path):
+    """In little; what no time is left for is named."""
+    out = tmp_path / "figures.json"
+    few = ["--device", "cpu", "--counts", "1,2", "--sizes", "31", "--frames", "2", "--iterations", "2"]
+    told = CliRunner().invoke(accelerator.main, [*few, "--no-compiled", "--out", str(out)])
+    assert told.exit_code == 0, told.output
+    figures = load(out).figures
+    assert figures["2 of 31 px, bspline3, eager: poses"].value > 0
+    assert figures["2 of 31 px, bspline3, eager: from the CPU's poses"].value < 1e-4
+    assert CliRunner().invoke(accelerator.main, [*few, "--minutes", "0"]).exit_code == 0

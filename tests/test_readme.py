@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 import torch_ecc as te
+from torch_ecc.sim import Camera, PlaneWaves, Sequence, SequenceDataset, harmonic, placed
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -51,6 +52,19 @@ def test_the_body_block_runs():
     exec(next(block for block in BLOCKS if "te.Body" in block), names)
     assert names["found"].used.all()
     assert names["found"].sigma[0, 2] < 1e-4
+
+
+def test_the_streams_block_runs():
+    """The synthetic datasets, read by workers, into one batch of trackers."""
+    paths = [placed(harmonic((4, 3, 0.02 * k), points=6), center=(90 + k, 80)) for k in range(3)]
+    scenes = [PlaneWaves.random(seed=seed) for seed in range(3)]
+    sequences = [Sequence(scene, path, Camera(size=(150, 180))) for scene, path in zip(scenes, paths, strict=True)]
+    names = {"te": te, "torch": torch, "streams": [SequenceDataset(each) for each in sequences]}
+    names["centers"] = torch.stack([path[0, :2] for path in paths])
+    exec(next(block for block in BLOCKS if "StackDataset" in block), names)
+    error = names["estimate"].pose - torch.stack([path[-1] for path in paths])
+    error[:, 2] += torch.stack([path[0, 2] for path in paths])
+    assert error.abs().max() < 0.02
 
 
 def test_first_screen():
