@@ -84,7 +84,8 @@ class Shutter(NamedTuple):
             change = (distortion - last).flatten(1).norm(dim=1) * reference.place.radius
             if is_cpu(start.device) and not bool((good & (change > tolerance)).any()):
                 break
-        return self.straightened(reference, estimate, self.velocity(start, state)[:, 2])
+        turned, age = start[:, 2] - state["past_poses"][:, 0, 2], state["past_ages"][:, 0]
+        return self.straightened(reference, estimate, torch.where(age > 0, turned / age.clamp(min=1), 0.0))
 
     def straightened(self, reference: Reference, estimate: Estimate, turning: Tensor) -> Estimate:
         """The ``estimate`` less what templates that are ``turning`` (R,) rad per frame are shifted by because they are
