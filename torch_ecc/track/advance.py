@@ -58,17 +58,6 @@ def remembering(state: State, image: Tensor, settings: Settings) -> Callable[[Re
     return look
 
 
-def begun(state: State, pose: Tensor) -> None:
-    """Templates of some other image begin at ``pose`` (R, 3), where a search has found them in the first frame: what
-    the next ones tell of that place says nothing of the image."""
-    state["start"].copy_(pose)
-    state["pose"].copy_(pose)
-    if "past_poses" in state:
-        state["past_poses"].copy_(pose[:, None])
-    if "lesson_moves" in state:
-        state["lesson_moves"][:, 2] = 1e30  # not even
-
-
 def advanced(state: State, estimate: Estimate) -> Estimate:
     """One frame on, in which nothing is suspect: the ``estimate``."""
     last, since, pose = state["pose"], state["since"], estimate.pose.detach()

@@ -124,6 +124,17 @@ def as_rounds(average: int, renew: int | None) -> tuple[int, int]:
     return average if average > 1 else renew, renew
 
 
+def begun(state: State, pose: Tensor) -> None:
+    """Templates of some other image begin at ``pose`` (R, 3), where a search has found them in the first frame: what
+    the next ones tell of that place says nothing of the image."""
+    state["start"].copy_(pose)
+    state["pose"].copy_(pose)
+    if "past_poses" in state:
+        state["past_poses"].copy_(pose[:, None])
+    if "lesson_moves" in state:
+        state["lesson_moves"][:, 2] = 1e30  # not even
+
+
 def teaches(estimate: Estimate, suspects: list[bool]) -> Tensor:
     """Which templates (R,) a frame may teach."""
     right = (estimate.status == Status.CONVERGED) & (estimate.origin == Origin.TRACKED)

@@ -24,19 +24,11 @@ from torch_ecc.core.robust import Memory
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, seen_through
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, image_pyramid
-from torch_ecc.track.advance import (
-    advanced,
-    advanced_in_doubt,
-    beginning,
-    begun,
-    check_prediction,
-    remembering,
-    skipped,
-)
+from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, remembering, skipped
 from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.coarse import coarse_to_fine
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, told
+from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
 from torch_ecc.track.sensor import dead_in, shown
