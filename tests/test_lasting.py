@@ -63,6 +63,30 @@ def test_a_mean_of_frames_is_as_much_less_noisy(backend: str) -> None:
     assert float((error / sigma).square().mean().sqrt()) < 1.6
 
 
+@pytest.mark.parametrize(("speed", "share"), [((0.0, 0.0, 0.0), 1 / 16), ((0.6, -0.4, 0.002), 0.23)])
+def test_what_stood_still_or_moved_evenly_lies_where_all_frames_have_it(speed: tuple, share: float) -> None:
+    """Over many draws of the first frames, where the template lies is uncertain by that share of one frame's noise."""
+    along = torch.tensor(speed, dtype=torch.float64)
+    path = torch.tensor((*START, 0.0)).double() + torch.arange(17).double()[:, None] * along
+    clean, start = [PlaneWaves.random(seed=3).render(pose[None], FRAME) for pose in path], [START]
+    left, plain = [], []
+    for draw in range(12):
+        frames = [noisy(image, 100 * draw + k, 8.0) for k, image in enumerate(clean)]
+        trackers = [Tracker(frames[0], start, SIZE, search=False, average=n) for n in (16, 1)]
+        for errors, tracker in zip((left, plain), trackers, strict=True):
+            tracker.track_sequence(frames[1:16])
+            errors.append(tracker(clean[16][0, 0]).pose[0] - path[16])
+        assert float(trackers[0].lesson_share) == pytest.approx(share, abs=0.2 if share < 0.1 else 0.01)
+    ratio = torch.stack(left).square().mean(0) / torch.stack(plain).square().mean(0)
+    assert float(ratio.mean()) < 2 * share + 0.1
+
+
+def test_what_moved_unevenly_lies_where_the_first_frame_has_it() -> None:
+    """Nothing else tells where it was then."""
+    tracker, _, _ = tracked(film(12, 5.0), average=10)
+    assert float(tracker.lesson_share) == 1
+
+
 def test_a_surface_that_changes_is_followed() -> None:
     """Within what sigma says; what follows only the first frame loses it."""
     frames = film(100, 2.0, 1 / 80)
@@ -170,4 +194,4 @@ def test_who_learns_nothing_holds_nothing() -> None:
     """A tracker that is not told to learn has no such state."""
     names = dict(Tracker(film(1, 2.0)[0], [START], SIZE).named_buffers())
     assert not any(name.startswith("lesson") for name in names)
-    assert len(Lessons._fields) == 11
+    assert len(Lessons._fields) == 13

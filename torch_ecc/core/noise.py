@@ -22,20 +22,23 @@ LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes
 class Noise(NamedTuple):
     """Of B templates: ``level`` (B,), upper estimate of their noise, grey levels, ``power`` (B,), its square, and how
     many ``frames`` (B,) each is the mean of; ``alias``, of each sampler whose own error counts: (B, 3, 2), by how far
-    aliasing along the template's x and y shifts the pose, rms over the phase; ``place`` (B, 3, 3): covariance of where
-    the template itself lies, in its axes, None if that is certain."""
+    aliasing along the template's x and y shifts the pose, rms over the phase. Where a template lies is uncertain by a
+    ``place_share`` (B,) of what one frame's noise makes of a pose, and by a covariance ``place`` (B, 3, 3) in its axes,
+    None if that is nothing."""
 
     level: Tensor
     power: Tensor
     frames: Tensor
     alias: dict[str, Tensor]
+    place_share: Tensor
     place: Tensor | None = None
 
     @staticmethod
     def of(level: Tensor) -> Noise:
         """Of templates cut from one frame."""
         power = level.to(pose_dtype(level.device)).square()
-        return Noise(level, power, torch.ones_like(power), {})
+        one = torch.ones_like(power)
+        return Noise(level, power, one, {}, one.clone())
 
     @property
     def of_frame(self) -> Tensor:

@@ -59,7 +59,7 @@ def judge(
     if not on_cpu or min(score.tolist()) < settings.min_score:
         match = torch.maximum(score, detrended(normal, total))  # light alone must not make a stranger of the template
     power, error, axes = found.gain.square(), total[:, 6], turn(pose[:, 2])
-    of_both = 1 + power  # variance of template and frame together: where it lies, one frame alone has told
+    of_both = 1 + power * reference.noise.place_share  # variance of template and frame together
     # One image's noise v: of the residuals' mean square the template's part is gain^2 v / frames, the frame's, sampled,
     # NG v.
     of_template = power / reference.noise.frames

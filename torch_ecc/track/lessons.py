@@ -17,6 +17,7 @@ from torch import Tensor
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.criteria import Criterion
 from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.core.normal import LEAST
 from torch_ecc.core.patches import Crop
 from torch_ecc.core.pose import inverse as inverse_pose
 from torch_ecc.core.pose import rotation
@@ -30,6 +31,9 @@ SHARE = 0.5  # of a round's frames must have shown a pixel: else it stays what i
 ALIKE = 0.9  # correlation: a template less like its anchor is the next anchor
 UNLIKE = 0.2  # correlation: the first mean tells nothing of a template less like it
 FEWEST = 2  # frames of a round
+FEWEST_EVEN = 5  # frames that tell how it has moved in them
+CHANCE = 6.0  # over the square root of frames: so much more than noise may be noise
+SLOW = 2.0  # standard deviations of a speed that may be none
 SOME = 5.0  # renewals over which what they have corrected is averaged
 
 
@@ -40,7 +44,9 @@ class Lessons(NamedTuple):
     """What R templates learn, written in place: what the frames of this round have shown ``fresh`` in every pixel, its
     sum, and ``times`` (R, 1, h, w) each, how many frames; how many ``learned`` (R,) from in this round, and how many
     ``rounds`` (R,) there have been; the template's ``noise`` (R,) at first, and of how many ``frames`` (R,) it is the
-    mean now; the first mean, the ``origin``, and the ``anchor``, (R, 1, h, w) each; covariances (R, 3, 3), in the
+    mean now; of the first round the sums of poses from the start (R, 3, 3): of p, p times the number of the frame, and
+    p^2, the ``moves``, and what they leave of one frame's scatter in where the template lies, the ``share`` (R,); the
+    first mean, the ``origin``, and the ``anchor``, (R, 1, h, w) each; covariances (R, 3, 3), in the
     template's axes, of the ``origin_place``, the template's own, ``place``, and what renewals have corrected, ``lag``.
     """
 
@@ -50,6 +56,8 @@ class Lessons(NamedTuple):
     rounds: Tensor
     noise: Tensor
     frames: Tensor
+    moves: Tensor
+    share: Tensor
     origin: Tensor
     anchor: Tensor
     origin_place: Tensor
@@ -63,8 +71,9 @@ class Lessons(NamedTuple):
         none, one, place = torch.zeros_like(template), torch.ones_like(pose[:, 0]), pose.new_zeros(len(pose), 3, 3)
         images = none, torch.ones_like(template)
         counts = one.long(), torch.zeros_like(one).long()
-        places = (place.clone() for _ in range(3))
-        values = *images, *counts, noise.clone(), one.clone(), template.clone(), template.clone(), *places
+        moves, *places = (place.clone() for _ in range(4))
+        more = noise.clone(), one.clone(), moves, one.clone()
+        values = *images, *counts, *more, template.clone(), template.clone(), *places
         return dict(zip(LESSONS, values, strict=True))
 
 
@@ -87,7 +96,8 @@ def told(reference: Reference, state: State) -> Reference:
     lessons = lessons_in(state)
     if lessons is None:
         return reference
-    noise = reference.noise._replace(frames=lessons.frames.clone(), place=lessons.place + lessons.lag)
+    place, share = lessons.place + lessons.lag, lessons.share.clone()
+    noise = reference.noise._replace(frames=lessons.frames.clone(), place_share=share, place=place)
     return reference._replace(noise=noise)
 
 
@@ -114,6 +124,17 @@ def as_rounds(average: int, renew: int | None) -> tuple[int, int]:
     return average if average > 1 else renew, renew
 
 
+def begun(state: State, pose: Tensor) -> None:
+    """Templates of some other image begin at ``pose`` (R, 3), where a search has found them in the first frame: what
+    the next ones tell of that place says nothing of the image."""
+    state["start"].copy_(pose)
+    state["pose"].copy_(pose)
+    if "past_poses" in state:
+        state["past_poses"].copy_(pose[:, None])
+    if "lesson_moves" in state:
+        state["lesson_moves"][:, 2] = 1e30  # not even
+
+
 def teaches(estimate: Estimate, suspects: list[bool]) -> Tensor:
     """Which templates (R,) a frame may teach."""
     right = (estimate.status == Status.CONVERGED) & (estimate.origin == Origin.TRACKED)
@@ -131,20 +152,23 @@ class Teacher:
         self.surface: Surface | None = None  # of the templates as they are
 
     @lasting
-    def __call__(self, image: Tensor, warp: Tensor, teachable: Tensor, state: State) -> Tensor:
-        """Learn from an ``image`` (1 or R, 1, H, W), which shows the templates at ``warp`` (R, 2, 3), if it is
-        ``teachable`` (R,); which of them (n,) have become others, in the ``state``."""
+    def __call__(self, image: Tensor, warp: Tensor, estimate: Estimate, suspects: list[bool], state: State) -> Tensor:
+        """Learn from an ``image`` (1 or R, 1, H, W), which shows the templates at ``warp`` (R, 2, 3), what is not
+        suspect; which of them (n,) have become others, in the ``state``."""
         (first, later), crop, lessons = self.rounds, Crop(*(state[name] for name in Crop._fields)), lessons_in(state)
         if lessons is None:
             return torch.empty(0, dtype=torch.long)
         lengths = torch.where(lessons.rounds == 0, first, later)
-        which = (teachable & (lengths > 0)).nonzero()[:, 0]
+        which = (teaches(estimate, suspects) & (lengths > 0)).nonzero()[:, 0]
         if len(which) == 0:
             return which
         self.learn(image if len(image) == 1 else image[which], warp[which], which, crop, lessons)
+        moved = (estimate.pose - state["start"])[which]
+        numbered = moved * (lessons.learned[which, None] - 1)
+        lessons.moves.index_add_(0, which, torch.stack((moved, numbered, moved * moved), 1))
         done = which[lessons.learned[which] >= lengths[which]]
         if len(done) > 0:
-            self.renew(done, crop, lessons)
+            self.renew(done, estimate.sigma[done], crop, lessons)
         return done
 
     def learn(self, image: Tensor, warp: Tensor, which: Tensor, crop: Crop, lessons: Lessons) -> None:
@@ -161,8 +185,8 @@ class Teacher:
             total.index_add_(0, which, part.images(value[:, None].to(total)))
         lessons.learned.index_add_(0, which, torch.ones_like(which))
 
-    def renew(self, which: Tensor, crop: Crop, lessons: Lessons) -> None:
-        """A round of the templates at ``which`` (n,) is over."""
+    def renew(self, which: Tensor, sigma: Tensor, crop: Crop, lessons: Lessons) -> None:
+        """A round of the templates at ``which`` (n,), whose poses have ``sigma`` (n, 3), is over."""
         old, times = crop.template[which], lessons.times[which]
         enough = times >= SHARE * lessons.learned[which, None, None, None]
         mean = old + lessons.fresh[which] / times.clamp(min=1)
@@ -173,6 +197,9 @@ class Teacher:
         if bool(later.any()):
             moved = self.anchored(which, torch.where(enough, mean, old), enough, crop, lessons)
             mean = torch.where(later[:, None, None, None], moved, mean)
+        else:
+            offset, lessons.share[which] = at_first(lessons.moves[which], lessons.learned[which], sigma)
+            mean = shifted(mean, self.interpolation, offset, crop.centre[which])
         new = torch.where(enough, mean, old)
         crop.template[which] = new
         for image in (lessons.origin, lessons.anchor):
@@ -218,6 +245,26 @@ class Teacher:
         lessons.place[which] = torch.where(known, place, lessons.place[which])
         share = 1 / lessons.rounds[which].clamp(max=SOME)[:, None, None]
         lessons.lag[which] = torch.lerp(lessons.lag[which], step[:, :, None] * step[:, None], share.to(step))
+
+
+def at_first(moves: Tensor, frames: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """Where n templates were in the first frame as all of the ``frames`` (n,) tell it, from where that alone has them,
+    (n, 3), and the share (n,) of one frame's scatter that is left in that; ``moves`` (n, 3, 3) as in ``Lessons``.
+
+    That is known only of what stood still in these frames, or moved evenly: by no more off a line than by noise. The
+    first of them lies at 0 by itself.
+    """
+    n, frame = frames[:, None].to(moves), sigma.square() / 2  # half of it is the template's
+    (total, numbered, square), middle = moves.unbind(1), (n - 1) / 2
+    spread, mean = (n * (n * n - 1) / 12).clamp(min=LEAST), total / n
+    slope = (numbered - middle * total) / spread
+    left = (square - n * mean * mean - slope * slope * spread) / (n - 2).clamp(min=1)
+    even = ((left <= frame * (1 + CHANCE / (n - 2).clamp(min=1).sqrt())) & (n > FEWEST_EVEN)).all(1)
+    still = (slope.square() * spread <= SLOW**2 * frame).all(1)
+    line = mean - slope * middle
+    offset = torch.where(still[:, None], mean, line)
+    share = torch.where(still, 1 / n[:, 0], (4 * n - 2)[:, 0] / (n * (n + 1))[:, 0])
+    return torch.where(even[:, None], offset, 0.0), torch.where(even, share, 1.0)
 
 
 def sampled(image: Tensor, interpolation: str, warp: Tensor, template: Tensor) -> Tensor:

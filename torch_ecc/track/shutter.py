@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Origin, Status
-from torch_ecc.core.pose import rotation
+from torch_ecc.core.pose import rotation, turn
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import is_cpu
 
@@ -27,6 +27,8 @@ NODES = 4  # earlier poses that a velocity is of: at 0.7 rad per frame, it is ri
 OLDEST = 12.0  # frames: what is older tells nothing of how it moves now
 PASSES = 4  # of one frame
 LARGEST = 0.5  # of |s v|: a target that moves on by half of what is read out is not to be recognised
+
+BENDS = [3, 4]  # of blocks.STRAINS
 
 State = Mapping[str, Tensor]
 
@@ -82,7 +84,18 @@ class Shutter(NamedTuple):
             change = (distortion - last).flatten(1).norm(dim=1) * reference.place.radius
             if is_cpu(start.device) and not bool((good & (change > tolerance)).any()):
                 break
-        return estimate
+        turned, age = start[:, 2] - state["past_poses"][:, 0, 2], state["past_ages"][:, 0]
+        return self.straightened(reference, estimate, torch.where(age > 0, turned / age.clamp(min=1), 0.0))
+
+    def straightened(self, reference: Reference, estimate: Estimate, turning: Tensor) -> Estimate:
+        """The ``estimate`` less what templates that are ``turning`` (R,) rad per frame are shifted by because they are
+        bent: their rows turn one after the other. (In theta that is next to nothing, and stays.)"""
+        theta, inverse, radius = estimate.pose[:, 2], reference.normal.inverse[:, :3], reference.place.radius
+        bends = reference.parts.strain[:, :, BENDS].sum(3, dtype=theta.dtype)
+        size = torch.stack((theta.cos(), -theta.sin()), 1) * (self.line * turning * radius.square())[:, None]
+        shift = (turn(theta) @ inverse @ bends @ size[:, :, None])[:, :, 0] * theta.new_tensor((1.0, 1.0, 0.0))
+        shift = torch.where(Status.good(estimate.status)[:, None], shift, 0.0)
+        return estimate._replace(pose=estimate.pose - shift, displacement=estimate.displacement - shift)
 
     def distortion(self, pose: Tensor, state: State) -> Tensor | None:
         """``distorted``, None if all rows are exposed at once."""

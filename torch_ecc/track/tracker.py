@@ -28,7 +28,7 @@ from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, chec
 from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.coarse import coarse_to_fine
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, noise_left, renewed, teaches, told
+from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
 from torch_ecc.track.sensor import dead_in, shown
@@ -177,8 +177,8 @@ class Tracker(nn.Module):
         settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
         tracker.register_buffer("first", _kept(filled(view, tracker.frame_mask)))
-        tracker.start.copy_(located.pose)
-        tracker.pose.copy_(located.pose)
+        tracker.shutter.check(view.shape[2])
+        begun(tracker._buffers, located.pose)
         return tracker, located
 
     @property
@@ -213,7 +213,7 @@ class Tracker(nn.Module):
             distortion = self.shutter.distortion(estimate.pose, state)
             warp = self.references[0].distorted(distortion).warps(estimate.pose)
             with torch.no_grad():
-                new = self._teacher(image, warp, teaches(estimate, suspects), state)
+                new = self._teacher(image, warp, estimate, suspects, state)
                 if len(new) > 0:
                     self._use(renewed(self.references, new, state, self._prepared))
         self.shutter.remember(state, estimate)

@@ -1,0 +1,84 @@
+"""Surfaces that change, that stay, and that are read row by row, for templates that are to last."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from films.shot import NOISE, SCENES, sense
+from torch_ecc.sim import PlaneWaves, Scene
+from torch_ecc.sim.camera import sensor
+
+FRAME, CENTER, SIZE = (260, 280), (140.0, 130.0), 121
+CHANGES = ("dissolves", "wave by wave", "patch by patch")
+LIFE = 400  # frames
+PATCH = 12  # px: side of what is replaced at once
+READ = 0.9  # of a frame's time, for all its rows
+
+
+def wander(count: int) -> Tensor:
+    """Poses (F, 3) over 9 px and 3 deg, upright on a whole pixel at first, that never lie alike between pixels."""
+    time = torch.arange(count, dtype=torch.float64)
+    x, y = (torch.sin(math.tau * time / cycle) for cycle in (40.0, 54.8))
+    return torch.stack((CENTER[0] + 9 * x, CENTER[1] + 7 * y, math.radians(3) * x), -1)
+
+
+def changing(family: str, change: str, seed: int, frames: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Frames (h, w) uint8 and true poses (3,) of a surface that loses 1/LIFE of its texture in each of the ``frames``
+    after the first, and gets another one for it."""
+    old, new = (SCENES[family](100 + 2 * seed + k) for k in (0, 1))
+    for k, pose in enumerate(wander(frames + 1)):
+        image = aged(old, new, change, k / LIFE, seed)(pose[None])
+        yield sense(image, 10_000 * seed + k, NOISE)[0, 0], pose
+
+
+def aged(old: Scene, new: Scene, change: str, share: float, seed: int) -> Callable[[Tensor], Tensor]:
+    """What renders (1, 1, h, w) the ``old`` scene of which a ``share`` is the ``new`` one's."""
+    if change == "wave by wave" and isinstance(old, PlaneWaves) and isinstance(new, PlaneWaves):
+        order = torch.randperm(len(old.waves), generator=torch.Generator().manual_seed(seed))
+        gone = torch.zeros(len(order), dtype=torch.bool)
+        gone[order[: round(share * len(order))]] = True
+        waves = torch.where(gone[:, None], new.waves, old.waves)
+        rest = (torch.where(gone, getattr(new, n), getattr(old, n)) for n in ("amplitudes", "phases"))
+        return partial(PlaneWaves(waves, *rest).render, size=FRAME)
+    if change == "patch by patch":
+        return partial(_patched, old=old, new=new, share=share, seed=seed)
+    return lambda poses: (1 - share) * old.render(poses, FRAME) + share * new.render(poses, FRAME)
+
+
+def _patched(poses: Tensor, old: Scene, new: Scene, share: float, seed: int) -> Tensor:
+    """Of squares of the surface, each at a time of its own."""
+    back = poses[0]
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in FRAME), indexing="ij")
+    c, s = math.cos(float(back[2])), math.sin(float(back[2]))
+    u, v = c * (x - back[0]) - s * (y - back[1]), s * (x - back[0]) + c * (y - back[1])
+    i, j = ((w / PATCH).floor().long() + 50 for w in (u, v))
+    when = torch.rand(100, 100, generator=torch.Generator().manual_seed(seed))
+    return torch.where(when[j, i] < share, new.render(poses, FRAME)[0, 0], old.render(poses, FRAME)[0, 0])[None, None]
+
+
+def still(seed: int, frames: int, noise: float = NOISE) -> Iterator[Tensor]:
+    """Frames (h, w) of a scene in which nothing moves."""
+    image = PlaneWaves.random(seed=seed).render(wander(1), FRAME)
+    for k in range(frames + 1):
+        yield sensor.quantise(sensor.read(image, noise, sensor.generator(seed, k)), 8)[0, 0]
+
+
+def swaying(seed: int, frames: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Frames (h, w) whose rows are exposed one after the other, and poses (3,) when the target's middle row is, of a
+    sway by 5 px at 0.7 rad per frame, from rest."""
+    scene, middle, line = PlaneWaves.random(seed=seed), FRAME[0] / 2, READ / FRAME[0]
+
+    def at(time: float) -> Tensor:
+        return torch.tensor((CENTER[0] + 5 * math.sin(0.7 * max(time, 0)), CENTER[1], 0.0), dtype=torch.float64)
+
+    for k in range(frames + 1):
+        rows = [at(k + line * (row - middle) if k else 0.0) for row in range(FRAME[0])]
+        parts = [
+            scene.render((pose - torch.tensor((0.0, row, 0.0)))[None], (1, FRAME[1])) for row, pose in enumerate(rows)
+        ]
+        yield sense(torch.cat(parts, 2), 10_000 * seed + k, NOISE)[0, 0], at(k + line * (CENTER[1] - middle))
