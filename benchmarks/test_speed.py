@@ -1,4 +1,4 @@
-"""Times of the library's own steps: pytest benchmarks/test_speed.py --benchmark-enable [--benchmark-group-by=func]
+"""Times of the library's own steps: pytest benchmarks/test_speed.py --benchmark-enable -n 0 [--benchmark-group-by=func]
 
 One 121 x 121 template in 640 x 480 uint8 on one thread, by sampler and backend. A plain ``pytest`` does not collect it,
 and nothing here asserts a time.
