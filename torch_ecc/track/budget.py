@@ -9,6 +9,7 @@ from __future__ import annotations
 from torch import Tensor
 
 BURST = 3000.0  # frames of credit at most, and at first
+LEAST_FRAME = 400_000  # pixels' worth that every frame takes, however small it is: it has to come from somewhere
 SOLVE = 20  # times the pixels of a template: its solve
 CORRELATION = 4  # times the pixels of a spectrum, for every angle
 
@@ -18,7 +19,7 @@ class Budget:
     if many are lost are parts of a tracker's state, written in place."""
 
     def __init__(self, credit: Tensor, turn: Tensor, pixels: int, textured: int) -> None:
-        self.credit, self.turn, self.frame = credit, turn, pixels + SOLVE * textured
+        self.credit, self.turn, self.frame = credit, turn, max(pixels + SOLVE * textured, LEAST_FRAME)
 
     def left(self) -> bool:
         """Whether there is any credit, which is BURST at most."""
