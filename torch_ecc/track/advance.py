@@ -17,6 +17,7 @@ from torch_ecc.track.budget import BURST
 PREDICTIONS = ("hold", "velocity")
 MEMORY = 0.05  # weight of the newest frame in the usual score
 KEPT = 16  # frames for which a template that is not found is expected to go on as before
+FARTHEST = 44.0  # px that it may have gone on by: farther away are look-alikes that nothing is known of
 
 State = Mapping[str, Tensor]  # a tracker's buffers: see there
 
@@ -103,6 +104,8 @@ def coast(state: State, good: Tensor) -> None:
     """One frame on, in which those were found that are ``good`` (R,): the others are expected to go on as they went
     for a while, and then where they were last."""
     since = state["since"]
-    longer = torch.where(since < KEPT, (since + 1) / since, 0.0)
+    longer = (since + 1) / since
+    far = torch.linalg.vector_norm(state["velocity"][:, :2], dim=1) * longer > FARTHEST
+    longer = torch.where((since < KEPT) & ~far, longer, 0.0)
     state["velocity"].mul_(torch.where(good, 1.0, longer).unsqueeze(1))
     since.add_(1).masked_fill_(good, 1)
