@@ -13,9 +13,7 @@ from pathlib import Path
 
 import click
 import torch
-from results import save
-from rich.console import Console
-from rich.table import Table
+from results import save, show
 from scatter import Draws, Scatter, by_sampler, least, scatter
 from sequences import Run, track_path, under_light
 from torch import Tensor
@@ -32,14 +30,6 @@ from torch_ecc.sim.scene.waves import PlaneWaves
 SCENES = {"waves": PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0), "pads": Pads.wafer()}
 SAMPLERS = ("bilinear", "bspline3", "bspline5")
 MOTIONS = {False: "shifts only", True: "any angle"}
-console = Console(width=120)
-
-
-def show(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-    table = Table(*header, title=title, title_justify="left")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
 
 
 def scatters(draws: int) -> list[Number]:

@@ -19,9 +19,7 @@ import click
 import cv2
 import numpy as np
 import torch
-from results import save
-from rich.console import Console
-from rich.table import Table
+from results import save, show
 from rigid import SCENE, Drawn, Near, Plan, draw
 from rivals import rivals
 from scaling import slope
@@ -38,14 +36,6 @@ from torch_ecc.sim import Camera, harmonic, placed
 SECTIONS = ("scatters", "apart", "lenses", "speed", "steps", "clockwork")
 APART = (0, 1, 5, 10, 15)
 UM_PER_PX = 0.55  # of the paper's camera at 10 x
-console = Console(width=150)
-
-
-def show(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-    table = Table(*header, title=title, title_justify="left")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
 
 
 def scatters(draws: int) -> list[Number]:
@@ -121,9 +111,9 @@ def lenses(frames: int) -> list[Number]:
         tracker, track = _followed(plan, lens, moves)
         sent = UM_PER_PX * (moves - plan.middle)[:, :2] if commanded else None
         try:
-            console.print(f"{words}: {te.calibrate(track, sent, tracker=tracker)}")
+            print(f"{words}: {te.calibrate(track, sent, tracker=tracker)}")
         except ValueError as error:
-            console.print(f"{words}: {error}")
+            print(f"{words}: {error}")
     return figures
 
 
@@ -158,7 +148,7 @@ def speed(rounds: int) -> list[Number]:
         figures.append(Number(f"{len(centers)} patches and their body / over OpenCV's", a / c, "x", "higher", 0.5))
     header = ("patches", "with body 1/s", "without 1/s", "body ms", "OpenCV 1/s", "times faster")
     show("640 x 480, two threads", header, rows)
-    console.print(f"slope over patches: {slope(taken, taken.values()):.2f}")
+    print(f"slope over patches: {slope(taken, taken.values()):.2f}")
     return figures + _large(rounds)
 
 
@@ -189,7 +179,7 @@ def _large(rounds: int) -> list[Number]:
     body = te.Body(tracker)
     taken = [_timed(lambda frame: body(tracker(frame)), frame) for frame in frames[1:]]
     rate = 1 / statistics.median(taken[2:])
-    console.print(f"2048 x 2048, 16 patches of 121 px with their body: {rate:.0f} frames per second")
+    print(f"2048 x 2048, 16 patches of 121 px with their body: {rate:.0f} frames per second")
     return [Number("2048^2, 16 patches of 121 px and their body", rate, "1/s", "higher", 0.5)]
 
 

@@ -1,4 +1,4 @@
-"""A benchmark's figures as JSON: name, value, unit, which way is better, tolerance; with versions and machine."""
+"""A benchmark's figures as a table and as JSON: name, value, unit, which is better, tolerance; versions, machine."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rich.console import Console
+from rich.table import Table
+
 from torch_ecc.paper.result import Number, environment
 
 PEERS = ("opencv-python-headless", "pystackreg", "SimpleITK")
@@ -20,6 +23,14 @@ class Result(NamedTuple):
 
     about: dict[str, str]
     figures: dict[str, Number]
+
+
+def show(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    """A table for people, under its title."""
+    table = Table(*header, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=150).print(table)
 
 
 def save(path: Path, figures: Iterable[Number], **about: str) -> None:

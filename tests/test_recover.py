@@ -15,6 +15,8 @@ from torch_ecc import Origin, Status, Tracker
 from torch_ecc.core.pose import compose
 from torch_ecc.io import open_frames
 from torch_ecc.sim.scene.scene import PlaneWaves
+from torch_ecc.track.advance import FARTHEST, beginning, coast
+from torch_ecc.track.budget import Budget
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.recover import Recovery, common_motion, gone_together
 
@@ -277,6 +279,31 @@ def test_what_moves_on_while_it_is_hidden_is_expected_where_it_has_gone():
         estimate = tracker(torch.full_like(stack[0], 90) if hidden else stack[k])
         assert (estimate.status == Status.LOST) == hidden
     assert (estimate.displacement[0] - torch.tensor([60.0, 24.0, 0.0])).abs().max() < 0.05
+
+
+@pytest.mark.parametrize("step", [1.0, 3.1, 8.0, 50.0])
+def test_what_is_hidden_is_expected_nowhere_that_nothing_is_known_of(step):
+    """A look-alike is where it would have gone by then: it is expected where it was last."""
+    state = beginning(torch.zeros(1, 3, dtype=torch.float64))
+    state["velocity"][:] = torch.tensor([step * 0.6, step * 0.8, 0.0])
+    gone = []
+    for _ in range(20):
+        coast(state, torch.tensor([False]))
+        gone.append(float(state["velocity"][0, :2].norm()))
+    assert max(gone) <= FARTHEST
+    assert gone[-1] == 0
+    if step < 20:
+        assert gone[0] == pytest.approx(2 * step)
+
+
+def test_a_small_frame_pays_for_a_search_as_one_of_a_usual_video():
+    """Else a few searches in the dark take all that a small target has."""
+    spent = []
+    for pixels in (96 * 80, 640 * 480):
+        credit = torch.tensor(100.0, dtype=torch.float64)
+        Budget(credit, torch.zeros((), dtype=torch.int64), pixels, 31 * 31).spend(0, 20_000_000)
+        spent.append(100 - float(credit))
+    assert spent[0] == pytest.approx(spent[1], rel=0.2)
 
 
 @pytest.mark.parametrize("step", [(20.0, 30.0), (60.0, 6.0)])
