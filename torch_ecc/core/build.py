@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
@@ -147,10 +148,12 @@ def _placed(target: Target, kind: str, values: Mapping[str, float], scratch: Pat
     command += [*FLAGS, *(f"-D{name}={value!r}" for name, value in values.items()), *target.instructions[kind]]
     run([*command, str(SOURCES / "engine.cpp"), "-o", str(made), *target.linking], made)
     library = folder / f"{kind}-{key(values)}-{digest(made)}{target.suffix}"
+    when = made.stat().st_mtime
     made.replace(library)
     for other in folder.glob(f"{kind}-*"):
-        if other.stat().st_mtime < library.stat().st_mtime:
-            other.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # whoever builds beside us has removed it
+            if other.stat().st_mtime < when:
+                other.unlink()
     return library
 
 
