@@ -133,8 +133,9 @@ def build(folder: Path, target: Target) -> list[Path]:
     that they replace gone. Raises BuildError."""
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(".building-*"):  # by what was killed
-        if time.time() - left.stat().st_mtime > SECONDS:
-            shutil.rmtree(left, ignore_errors=True)
+        with suppress(FileNotFoundError):  # whoever builds beside us has ended
+            if time.time() - left.stat().st_mtime > SECONDS:
+                shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".building-") as scratch, ThreadPoolExecutor() as pool:
         values = constants()  # once: what parses is not safe in threads
         return list(pool.map(lambda kind: _placed(target, kind, values, Path(scratch)), target.instructions))
