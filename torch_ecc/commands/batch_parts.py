@@ -49,7 +49,6 @@ from torch_ecc.io.summary import write_json
 PIECES = ".parts"  # in the folder of all results: parts that are done, until they are joined
 AHEAD = 64  # frames that a part tracks before its own
 SEAM = (1e-4, 1e-4, 1e-6)  # px, px, rad: two parts agree so well, or one of them is tracked again
-AT_ONCE = 4096  # frames that are copied at once
 
 
 class Seam(NamedTuple):
@@ -175,7 +174,7 @@ def _append(session: Session, piece: Path, own: range, watch: Watch) -> Seam:
 def _copy(session: Session, part: tuple[Path, Unfinished], begin: int, turns: NDArray[np.int64]) -> None:
     """Append a part's frames from index ``begin`` on, each template turned by so many whole ``turns`` (R,)."""
     piece, left = part
-    records, joined = left.records(piece), Unfinished.of(session.folder)
+    joined = Unfinished.of(session.folder)
     if joined is None:
         journal = Journal.begin(session.folder, left.form, session.settings)
     else:
@@ -184,8 +183,7 @@ def _copy(session: Session, part: tuple[Path, Unfinished], begin: int, turns: ND
         with rows_file(piece).open("rb") as file:
             header = next(file)
             lines = islice(file, begin * left.form.templates, None)
-            for k in range(begin, left.frames, AT_ONCE):
-                some = np.array(records[k : min(k + AT_ONCE, left.frames)])
+            for some in left.blocks(piece, begin):
                 rows: Iterator[bytes] = islice(lines, len(some) * left.form.templates)
                 if turns.any():
                     rows = _turned(session, some, turns, (header, rows))

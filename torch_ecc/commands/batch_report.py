@@ -58,15 +58,16 @@ def _cell(value: Any) -> str:
 
 
 def _draw(folder: Path, rows: list[Row]) -> None:
-    from torch_ecc.plots.batch import Panel, plot_batch  # slow to import
+    from torch_ecc.plots.batch import POINTS, Panel, plot_batch  # slow to import
+    from torch_ecc.plots.blocks import blocks
 
     def panel(row: Row) -> Panel:
         if row["status"] != TRACKED:
             return Panel(row["folder"], None, row.get("words") or row["status"])
+        every = max(row["frames"] // POINTS, 1)
         with np.load(folder / row["folder"] / "track.npz") as track:
-            moved = track["displacement"]
-        with np.errstate(all="ignore"):
-            return Panel(row["folder"], moved, f"{row['lost']} lost" if row["lost"] else "")
+            moved = np.concatenate([some["displacement"][:1] for some in blocks(track, ["displacement"], every)])
+        return Panel(row["folder"], moved, f"{row['lost']} lost" if row["lost"] else "")
 
     plot_batch(map(panel, rows), folder / PICTURE)
 

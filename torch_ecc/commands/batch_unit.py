@@ -189,9 +189,10 @@ def finished_row(work: Work, finished: Finished, folder: Path, *, remarks: list[
     """The row of what was tracked. Sigma and drift are medians over the templates: of each one's usual sigma, and of
     where it was seen last, from where it began."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    sigma = [list(each["median_sigma"].values()) for each in summary["per_template"]]
+    names, each = ("median_sigma", "last_displacement"), summary["per_template"]
+    sigma, drift = ([list(template[name].values()) for template in each] for name in names)
     numbers = (finished.frames, len(finished.lost), int(finished.lost.sum()), finished.damaged)
-    medians = [*_medians(sigma), *_medians(_last_seen(folder / "track.npz"))]
+    medians = [*_medians(sigma), *_medians(drift)]
     known = dict(zip((*NUMBERS, *SIGMA, *DRIFT), (*numbers, *medians), strict=True))
     return row_of(work, TRACKED, **known, words="; ".join(remarks))
 
@@ -201,15 +202,6 @@ def _medians(values: Any) -> list[float | None]:
     columns = np.array(values, dtype=np.float64).T
     kept = [column[np.isfinite(column)] for column in columns]
     return [float(np.median(column)) if len(column) else None for column in kept]
-
-
-def _last_seen(track: Path) -> list[list[float]]:
-    """(R, 3) the last displacement of each template that is known, NaN where none is."""
-    with np.load(track) as archive:
-        displacement = archive["displacement"]
-    seen = np.isfinite(displacement[..., 0])
-    last = len(seen) - 1 - seen[::-1].argmax(0)
-    return displacement[last, np.arange(seen.shape[1])].tolist()  # type: ignore[no-any-return]
 
 
 # ---- the folder of work in progress ----------------------------------------------------------------------------------

@@ -148,7 +148,7 @@ class Session:
             left = self._left(films)
             run = _Run(self, self._track_writer(left), films)
             if left is not None:
-                run.go_on(left.records(self.folder))
+                run.go_on(left, self.folder)
             stopped: BaseException | None = None
             try:
                 with run, suppress(*([KeyboardInterrupt] if self.source.live else [])):  # how else would a camera end
@@ -172,7 +172,7 @@ class Session:
             left = self._left([])
             run = _Run(self, self._track_writer(left), [])
             if left is not None:
-                run.go_on(left.records(self.folder))
+                run.go_on(left, self.folder)
                 first = _last(left, self.folder) + 1
             try:
                 run.through(ahead(self.source.between(first, last)), progress)
@@ -330,16 +330,17 @@ class _Run:
             self.damaged += int(damaged[:, 0].sum())
             self.lost += ((status > Status.MAX_ITERATIONS) & ~damaged).sum(0)
 
-    def go_on(self, records: NDArray[Any]) -> None:
-        """After the ``records`` (F,) of an unfinished run."""
-        restore(self._state, np.array(records["state"][-1]).tobytes())
-        status = np.array(records["status"])
+    def go_on(self, left: Unfinished, folder: Path) -> None:
+        """After the frames that an unfinished run has left in ``folder``."""
+        records = left.records(folder)
+        restore(self._state, records["state"][-1].tobytes())
         for film in self.films:
-            pose, found = np.array(records["pose"]), status <= Status.MAX_ITERATIONS
+            pose, found = np.array(records["pose"]), records["status"] <= Status.MAX_ITERATIONS
             if self.body is not None and isinstance(film, OverlayWriter):  # the body, too, whose trail begins anew
                 pose, found = np.pad(pose, ((0, 0), (0, 1), (0, 0))), np.pad(found, ((0, 0), (0, 1)))
             film.go_on(pose, found)
-        self._count(status, np.array(records["reason"]))
+        for block in left.blocks(folder):
+            self._count(block["status"], block["reason"])
 
 
 def state_of(tracker: Tracker) -> list[Tensor]:

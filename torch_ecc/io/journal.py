@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import FileIO
 from itertools import islice
@@ -26,6 +26,7 @@ from torch_ecc.io.table import Table
 
 _RECORDS, _TABLE = "track.records", "track.csv"
 _HEADER = 8  # digits of the length of what the records begin with
+_BLOCK = 1 << 22  # bytes of records that are read at once
 
 
 class Form(NamedTuple):
@@ -84,6 +85,15 @@ class Unfinished(NamedTuple):
     def records(self, folder: Path) -> NDArray[Any]:
         """(F,) records, mapped from the file."""
         return np.memmap(part(folder, _RECORDS), self.form.dtype, "r", self.start, shape=(self.frames,))
+
+    def blocks(self, folder: Path, first: int = 0) -> Iterator[NDArray[Any]]:
+        """The records from index ``first`` on, some at a time: read, since all that is mapped counts as memory."""
+        dtype = self.form.dtype
+        most = max(_BLOCK // dtype.itemsize, 1)
+        with part(folder, _RECORDS).open("rb") as file:
+            file.seek(self.start + first * dtype.itemsize)
+            for index in range(first, self.frames, most):
+                yield np.fromfile(file, dtype, min(most, self.frames - index))
 
 
 @dataclass
@@ -165,9 +175,9 @@ class Journal:
                 os.unlink(file.name)
         return self.frames > 0
 
-    def records(self) -> NDArray[Any]:
-        """(F,) records, mapped from the file."""
-        return Unfinished({}, self.form, self.start, self.frames).records(self.folder)
+    def blocks(self) -> Iterator[NDArray[Any]]:
+        """All records, some at a time."""
+        return Unfinished({}, self.form, self.start, self.frames).blocks(self.folder)
 
     def remove(self) -> None:
         """The results are whole: nobody needs to go on."""

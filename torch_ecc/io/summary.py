@@ -16,23 +16,84 @@ from numpy.typing import NDArray
 from torch_ecc.io.output import append, create
 from torch_ecc.io.records import CONVERGED, DAMAGED, DOUBTFUL, ReasonNames, StatusNames
 
+_CODES = 128  # that an int8 has for a status or a reason
+_VALUES = 1 << 20  # of all templates: medians over more are taken of frames some apart
+_NEVER = -1
 
-def summarise(
-    records: NDArray[Any], names: StatusNames, reasons: ReasonNames, error: BaseException | None
-) -> dict[str, object]:
-    """What (F,) records of R templates say; ``error`` is what ended the run before its time, if anything did."""
-    templates, damaged = records["score"].shape[1], [code for code, word in names.items() if word == DAMAGED]
-    return {
-        "complete": error is None,
-        "reason": _describe(error),
-        "frames": len(records),
-        "damaged_frames": int(np.isin(records["status"][:, 0], damaged).sum()),
-        "templates": templates,
-        "rows": records["score"].size,
-        "reasons": _counted(records["reason"], reasons),
-        "per_template": [_summarise_template(records, names, reasons, index) for index in range(templates)],
-        "versions": versions(),
-    }
+
+class Tally:
+    """What the records of ``frames`` frames of R ``templates`` come to; they are added some at a time, and memory does
+    not grow with their number. ``names`` and ``reasons`` are the words of their codes."""
+
+    def __init__(self, templates: int, frames: int, names: StatusNames, reasons: ReasonNames) -> None:
+        self._names, self._reasons, self._frames = names, reasons, 0
+        self._apart = max(frames * templates // _VALUES, 1)  # in frames, of those that the medians are of
+        self._variances: list[NDArray[np.float64]] = []
+        self._codes = {field: np.zeros((templates, _CODES), np.int64) for field in ("status", "reason")}
+        self._first, self._last = np.full((2, templates), _NEVER)
+        self._score, self._coverage, self._found = np.zeros((3, templates))
+        self._least, self._drift = np.full(templates, math.inf), np.full((templates, 3), math.nan)
+
+    def add(self, records: NDArray[Any]) -> None:
+        """(F,) of them more, as they follow those before."""
+        found = np.isin(records["status"], [k for k, word in self._names.items() if word in (CONVERGED, DOUBTFUL)])
+        for field, counts in self._codes.items():
+            counts += [np.bincount(codes, minlength=_CODES) for codes in records[field].T]
+        self._score += records["score"].sum(0)
+        self._coverage += np.where(found, records["coverage"], 0.0).sum(0)
+        self._least = np.minimum(self._least, np.where(found, records["coverage"], math.inf).min(0))
+        self._found += found.sum(0)
+        (first, last), (_, seen) = _ends(~found), _ends(found)
+        self._first = np.where((self._first == _NEVER) & (first != _NEVER), self._frames + first, self._first)
+        self._last = np.where(last != _NEVER, self._frames + last, self._last)
+        moved = records["displacement"][seen, np.arange(len(seen))]
+        self._drift = np.where((seen != _NEVER)[:, None], moved, self._drift)
+        some = records["covariance"][-self._frames % self._apart :: self._apart]
+        self._variances.append(np.diagonal(some, axis1=-2, axis2=-1).copy())
+        self._frames += len(records)
+
+    def summary(self, error: BaseException | None) -> dict[str, object]:
+        """Of all that was added; ``error`` is what ended the run before its time, if anything did."""
+        status, reason = self._codes["status"], self._codes["reason"]
+        median = np.sqrt(np.median(np.concatenate(self._variances), 0))
+        return {
+            "complete": error is None,
+            "reason": _describe(error),
+            "frames": self._frames,
+            "damaged_frames": sum(int(status[0, code]) for code, word in self._names.items() if word == DAMAGED),
+            "templates": len(status),
+            "rows": self._frames * len(status),
+            "reasons": _counted(reason.sum(0), self._reasons),
+            "per_template": [self._of(index) | {"median_sigma": _named(median[index])} for index in range(len(status))],
+            "versions": versions(),
+        }
+
+    def _of(self, template: int) -> dict[str, object]:
+        found = int(self._found[template])
+        lost_at = [int(each[template]) if each[template] != _NEVER else None for each in (self._first, self._last)]
+        return {
+            "status": _counted(self._codes["status"][template], self._names),
+            "reasons": _counted(self._codes["reason"][template], self._reasons),
+            "lost_frames": self._frames - found,
+            "first_lost_frame": lost_at[0],
+            "last_lost_frame": lost_at[1],
+            "mean_score": float(self._score[template]) / self._frames,
+            "mean_coverage": float(self._coverage[template]) / found if found else None,
+            "least_coverage": float(self._least[template]) if found else None,
+            "last_displacement": _named(self._drift[template]),
+        }
+
+
+def _ends(yes: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(R,) the first and the last index at which (F, R) is true, ``_NEVER`` where none is."""
+    any_of = yes.any(0)
+    first, last = yes.argmax(0), len(yes) - 1 - yes[::-1].argmax(0)
+    return np.where(any_of, first, _NEVER), np.where(any_of, last, _NEVER)
+
+
+def _named(values: NDArray[np.float64]) -> dict[str, float]:
+    """(3,) of a pose, by what they are."""
+    return dict(zip(("x_px", "y_px", "theta_rad"), values.tolist(), strict=True))
 
 
 def write_json(path: Path, summary: dict[str, object]) -> None:
@@ -41,33 +102,9 @@ def write_json(path: Path, summary: dict[str, object]) -> None:
         append(file, (json.dumps(plain(summary), indent=2, allow_nan=False) + "\n").encode())
 
 
-def _counted(values: NDArray[np.int8], names: StatusNames | ReasonNames) -> dict[str, int]:
-    """How many of the codes each word stands for, without those that have none."""
-    codes, counts = np.unique(values, return_counts=True)
-    return {names[code]: count for code, count in zip(codes.tolist(), counts.tolist(), strict=True) if names[code]}
-
-
-def _summarise_template(
-    records: NDArray[Any], names: StatusNames, reasons: ReasonNames, index: int
-) -> dict[str, object]:
-    status = np.asarray(records["status"][:, index])
-    found = np.isin(status, [code for code, word in names.items() if word in (CONVERGED, DOUBTFUL)])
-    lost, coverage = np.flatnonzero(~found), np.asarray(records["coverage"][:, index])[found]
-    variance = (records["covariance"][:, index, axis, axis] for axis in range(3))
-    return {
-        "status": _counted(status, names),
-        "reasons": _counted(records["reason"][:, index], reasons),
-        "lost_frames": len(lost),
-        "first_lost_frame": int(lost[0]) if len(lost) else None,
-        "last_lost_frame": int(lost[-1]) if len(lost) else None,
-        "mean_score": float(np.mean(records["score"][:, index])),
-        "mean_coverage": float(coverage.mean()) if len(coverage) else None,
-        "least_coverage": float(coverage.min()) if len(coverage) else None,
-        "median_sigma": {
-            name: math.sqrt(np.median(values))
-            for name, values in zip(("x_px", "y_px", "theta_rad"), variance, strict=True)
-        },
-    }
+def _counted(counts: NDArray[np.int64], names: StatusNames | ReasonNames) -> dict[str, int]:
+    """How often each word stands, of (K,) counts of the codes, without those that have none."""
+    return {names[code]: int(counts[code]) for code in np.flatnonzero(counts).tolist() if names[code]}
 
 
 def _describe(error: BaseException | None) -> str | None:

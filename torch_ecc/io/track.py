@@ -13,9 +13,11 @@ from contextlib import suppress
 from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import IO, Any, Self
+from zipfile import ZipFile
 
 import numpy as np
+from numpy.lib.format import dtype_to_descr, write_array, write_array_header_1_0
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,7 +25,7 @@ from torch_ecc.io.frames import Frame
 from torch_ecc.io.journal import Form, Journal, Unfinished
 from torch_ecc.io.output import check_folder, create, part, publish
 from torch_ecc.io.records import CONVERGED, DOUBTFUL, ReasonNames, Record, StatusNames, to_arrays, words
-from torch_ecc.io.summary import summarise, write_json
+from torch_ecc.io.summary import Tally, write_json
 
 FILES = ("track.csv", "track.npz", "summary.json")
 NO_REASON = {0: ""}
@@ -117,17 +119,17 @@ class TrackWriter:
 
     def _finish(self, journal: Journal, error: BaseException | None) -> None:
         seconds = time.perf_counter() - self._started
-        records = journal.records()
-        fields: dict[str, Any] = {name: records[name] for name in journal.fields} | self._constants()
         with BufferedWriter(create(part(self.out_dir, "track.npz"))) as file:
-            np.savez(file, **fields)  # copied through a small buffer
-        summary = summarise(records, self.status_names, self.reason_names, error)
+            _write_npz(file, journal, self._constants())
+        tally = Tally(journal.form.templates, journal.frames, self.status_names, self.reason_names)
+        for records in journal.blocks():
+            tally.add(records)
+        summary = tally.summary(error)
         rate = (journal.frames - self._before) / seconds
         summary |= {"frames_per_s": rate, "fps": self.fps, "settings": self.settings}
         if self.um_matrix is not None:
             summary["um_per_px"] = np.linalg.norm(self.um_matrix, axis=0).tolist()
         write_json(part(self.out_dir, "summary.json"), summary)
-        del records, fields  # memory maps, which would keep the file busy on some systems
         # The old summary goes first and the new one comes last: a summary always belongs to the files beside it.
         (self.out_dir / "summary.json").unlink(missing_ok=True)
         publish(self.out_dir, *FILES)
@@ -142,3 +144,19 @@ class TrackWriter:
             "reason_names": np.array(list(self.reason_names.values())),
         }
         return constants if self.um_matrix is None else constants | {"um_matrix": self.um_matrix}
+
+
+def _write_npz(file: IO[bytes], journal: Journal, constants: Mapping[str, NDArray[Any]]) -> None:
+    """What numpy.savez writes of a journal's fields and of ``constants``, of which it would want all at once."""
+    with ZipFile(file, "w") as archive:
+        for name in journal.fields:
+            kind = journal.form.dtype[name]
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                shape = (journal.frames, *kind.shape)
+                header = {"descr": dtype_to_descr(kind.base), "fortran_order": False, "shape": shape}
+                write_array_header_1_0(member, header)
+                for records in journal.blocks():
+                    member.write(records[name].tobytes())
+        for name, values in constants.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                write_array(member, values)

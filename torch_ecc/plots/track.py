@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -15,32 +16,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
+from torch_ecc.plots.envelope import Drawn, thinned
 from torch_ecc.plots.save import save
-
-_Array: TypeAlias = NDArray[np.float64]
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d31", "#5e4fa2", "#444444")
 _STATUS = {"CONVERGED": "#58b98a", "MAX_ITERATIONS": "#f2a93b", "LOST": "#d6453d"}
 _OTHER_STATUS = ("#8e3b6e", "#7a7a7a", "#3d3d3d")
-_FOUND = ("CONVERGED", "MAX_ITERATIONS")  # with every other status the pose is an old one, and is not drawn
-_BINS = 1500  # more points than this per curve would only be drawn on top of each other
-_NEEDED = ("displacement", "covariance", "score", "status", "residual_rms", "status_codes", "status_names")
 _MOSAIC = "xa;yb;tc;sr;wr"  # x, y, theta beside their sigma a, b, c; score and status words beside the residual
 _WIDTH, _TOP, _BOTTOM = 12.5, 0.8, 0.85  # inches: of all, and of what is above and below the curves
-
-
-class _Track(NamedTuple):
-    """What is drawn: (F,) times, (F, R, 3) displacement and sigma in (um or px, um or px, deg), (F, R) the rest."""
-
-    time: _Array
-    displacement: _Array
-    sigma: _Array
-    score: _Array
-    residual: _Array
-    status: NDArray[np.int64]
-    words: list[str]
-    time_label: str
-    unit: str
 
 
 def plot_track(
@@ -55,8 +38,10 @@ def plot_track(
 
     Raises FileNotFoundError, or ValueError if arrays are missing or there is no frame.
     """
-    data = _load(track)
-    templates = data.score.shape[1]
+    with ExitStack() as stack:
+        arrays = track if isinstance(track, Mapping) else stack.enter_context(np.load(track))
+        data = thinned(arrays)
+    templates = data.status.shape[1]
     height = 8.8 + 0.12 * min(templates, 16)
     figure = Figure(figsize=(_WIDTH, height))
     strip = 0.14 + 0.06 * min(templates, 16)
@@ -79,58 +64,13 @@ def plot_track(
     return save(figure, Path(path), dpi)
 
 
-def _load(track: str | Path | Mapping[str, ArrayLike]) -> _Track:
-    if not isinstance(track, Mapping):
-        with np.load(track) as archive:
-            return _load(dict(archive))
-    arrays = {name: np.asarray(value) for name, value in track.items()}
-    missing = [name for name in _NEEDED if name not in arrays]
-    if missing:
-        raise ValueError(f"plot_track: track must have {', '.join(_NEEDED)}; missing: {', '.join(missing)}")
-    if not arrays["score"].size:
-        raise ValueError("plot_track: track must have at least one frame and template")
-    status, words = _index_words(arrays)
-    displacement, sigma = _to_units(arrays)
-    found = np.isin(status, [k for k, word in enumerate(words) if word in _FOUND])[..., None]
-    timed, micrometres = "time_s" in arrays, "um_matrix" in arrays
-    return _Track(
-        time=arrays["time_s"] if timed else np.arange(len(status), dtype=np.float64),
-        displacement=np.where(found, displacement, np.nan),
-        sigma=np.where(found, sigma, np.nan),
-        score=arrays["score"],
-        residual=arrays["residual_rms"],
-        status=status,
-        words=words,
-        time_label="time (s)" if timed else "frame",
-        unit="µm" if micrometres else "px",
-    )
-
-
-def _index_words(arrays: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], list[str]]:
-    """Status codes (F, R) as indices into the words, which keep the order of their codes."""
-    codes = arrays["status_codes"]
-    order = np.argsort(codes)
-    status = np.searchsorted(codes[order], arrays["status"])
-    return status, [str(word) for word in arrays["status_names"][order]]
-
-
-def _to_units(arrays: Mapping[str, NDArray[Any]]) -> tuple[_Array, _Array]:
-    """Displacement and sigma (F, R, 3) in (um or px, um or px, deg); sigma is nan where it is not finite."""
-    units = np.eye(3)
-    units[:2, :2] = arrays.get("um_matrix", np.eye(2))
-    units[2, 2] = np.degrees(1.0)
-    covariance = np.where(np.isfinite(arrays["covariance"]), arrays["covariance"], np.nan)
-    rotated = units @ covariance @ units.T
-    return arrays["displacement"] @ units.T, np.sqrt(np.diagonal(rotated, axis1=-2, axis2=-1))
-
-
 def _choose_colours(count: int) -> list[Any]:
     if count <= len(_COLOURS):
         return list(_COLOURS[:count])
     return list(mpl.colormaps["viridis"](np.linspace(0, 1, count)))
 
 
-def _draw_motion(axes: Mapping[str, Axes], data: _Track, colours: list[Any]) -> None:
+def _draw_motion(axes: Mapping[str, Axes], data: Drawn, colours: list[Any]) -> None:
     """Left the displacement with its band, right the sigma, which is mostly too small to see on the left."""
     small = "nm" if data.unit == "µm" else "10⁻³ px"
     units = ((data.unit, small), (data.unit, small), ("deg", "10⁻³ deg"))
@@ -138,45 +78,41 @@ def _draw_motion(axes: Mapping[str, Axes], data: _Track, colours: list[Any]) -> 
         left, right = axes["xyt"[k]], axes["abc"[k]]
         left.set_ylabel(f"{symbol} displacement ({unit})")
         right.set_ylabel(f"\u03c3 of {symbol} ({sigma_unit})")
-        value, sigma = data.displacement[..., k], data.sigma[..., k]
         for r, colour in enumerate(colours):
-            _band(left, data.time, value[:, r], 3 * sigma[:, r], colour)
-            _curve(left, data.time, value[:, r], colour)
-            _curve(right, data.time, 1e3 * sigma[:, r], colour)
-        _limit(left, right, value, sigma)
+            low, high = (side[:, r, k] for side in data.band)
+            left.fill_between(data.time, low, high, color=colour, alpha=0.25, lw=0)
+            _curve(left, data, [side[:, r, k] for side in data.displacement], colour)
+            _curve(right, data, [1e3 * side[:, r, k] for side in data.sigma], colour)
+        _limit(left, right, data, k)
 
 
-def _limit(left: Axes, right: Axes, value: _Array, sigma: _Array) -> None:
+def _limit(left: Axes, right: Axes, data: Drawn, k: int) -> None:
     """Axes that few frames of great uncertainty do not blow up."""
-    if not np.isfinite(sigma).any():
+    usual, (lows, highs) = float(data.usual[k]), data.displacement
+    if np.isnan(usual):
         return
-    usual = float(np.nanpercentile(sigma, 99))
-    low, high = float(np.nanmin(value)) - 3 * usual, float(np.nanmax(value)) + 3 * usual
+    low, high = float(np.nanmin(lows[..., k])) - 3 * usual, float(np.nanmax(highs[..., k])) + 3 * usual
     if high > low:
         margin = 0.05 * (high - low)
         left.set_ylim(low - margin, high + margin)
         right.set_ylim(0, 1.25e3 * usual)
 
 
-def _draw_quality(axes: Mapping[str, Axes], data: _Track, colours: list[Any]) -> None:
+def _draw_quality(axes: Mapping[str, Axes], data: Drawn, colours: list[Any]) -> None:
     axes["s"].set_ylabel("score")
     axes["r"].set_ylabel("residual rms (grey levels)")
     for r, colour in enumerate(colours):
-        _curve(axes["s"], data.time, data.score[:, r], colour)
-        _curve(axes["r"], data.time, data.residual[:, r], colour)
+        _curve(axes["s"], data, [side[:, r] for side in data.score], colour)
+        _curve(axes["r"], data, [side[:, r] for side in data.residual], colour)
     axes["r"].set_ylim(bottom=0)
 
 
-def _draw_status(axis: Axes, data: _Track) -> None:
+def _draw_status(axis: Axes, data: Drawn) -> None:
     """One row per template; a bin of many frames shows the worst of them, which has the highest code."""
-    frames, templates = data.status.shape
-    rows = np.maximum.reduceat(data.status, _starts(frames), axis=0).T
-    step = data.time[1] - data.time[0] if frames > 1 else 1.0
-    extent = (data.time[0] - step / 2, data.time[-1] + step / 2, templates - 0.5, -0.5)
+    templates = data.status.shape[1]
     shades = ListedColormap(list(_status_colours(data.words).values()))
-    axis.imshow(
-        rows, cmap=shades, vmin=-0.5, vmax=len(data.words) - 0.5, aspect="auto", extent=extent, interpolation="nearest"
-    )
+    place: Any = {"extent": (*data.span, templates - 0.5, -0.5), "aspect": "auto", "interpolation": "nearest"}
+    axis.imshow(data.status.T, cmap=shades, vmin=-0.5, vmax=len(data.words) - 0.5, **place)
     axis.set_yticks(range(0, templates, max(1, -(-templates // 8))))
     axis.set_ylabel("status")
 
@@ -186,26 +122,13 @@ def _status_colours(words: list[str]) -> dict[str, str]:
     return {word: _STATUS.get(word) or _OTHER_STATUS[others.index(word) % len(_OTHER_STATUS)] for word in words}
 
 
-def _curve(axis: Axes, time: _Array, values: _Array, colour: Any) -> None:
-    if len(time) > 2 * _BINS:
-        starts = _starts(len(time))
-        values = np.stack((np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)), -1).ravel()
-        time = np.repeat(time[starts], 2)
+def _curve(axis: Axes, data: Drawn, sides: list[NDArray[np.float64]], colour: Any) -> None:
+    """Through both ``sides`` of an envelope."""
+    time, values = data.time, sides[0]
+    if data.frames > len(time):
+        time, values = np.repeat(time, 2), np.stack(sides, -1).ravel()
     # A point between two gaps makes no line: short tracks show their frames as dots, too.
     axis.plot(time, values, color=colour, lw=1.1, marker="." if len(time) <= 120 else None, ms=4)
-
-
-def _band(axis: Axes, time: _Array, middle: _Array, half: _Array, colour: Any) -> None:
-    low, high = middle - half, middle + half
-    if len(time) > 2 * _BINS:
-        starts = _starts(len(time))
-        time, low, high = time[starts], np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
-    axis.fill_between(time, low, high, color=colour, alpha=0.25, lw=0)
-
-
-def _starts(count: int) -> NDArray[np.int64]:
-    """First frames of the bins of a long track."""
-    return np.arange(0, count, -(-count // _BINS))
 
 
 def _dress(axis: Axes) -> None:
@@ -219,9 +142,9 @@ def _dress(axis: Axes) -> None:
         axis.locator_params(axis="y", nbins=5)
 
 
-def _annotate(figure: Figure, data: _Track, colours: list[Any], title: str) -> None:
+def _annotate(figure: Figure, data: Drawn, colours: list[Any], title: str) -> None:
     """Title, what each colour is, and what each status is that occurs."""
-    frames, templates = data.status.shape
+    frames, templates = data.frames, data.status.shape[1]
     count = f"{frames:,} frame{'s' * (frames > 1)}, {templates} template{'s' * (templates > 1)}"
     _, height = figure.get_size_inches()
     figure.suptitle(f"{title}   ({count})" if title else count, fontsize=13, y=1 - 0.15 / height, va="top")
