@@ -19,7 +19,7 @@ from click.testing import CliRunner
 
 import torch_ecc
 from torch_ecc import cli
-from torch_ecc.cli import app, main
+from torch_ecc.cli import app, main, progress_bar
 from torch_ecc.commands.track import Session, TrackJob
 from torch_ecc.core import library
 from torch_ecc.sim.scene.waves import PlaneWaves
@@ -264,3 +264,14 @@ def test_the_exit_status_whatever_a_command_ends_with(monkeypatch, raised, statu
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == status
+
+
+def test_a_bar_shows_once_something_is_done(capsys):
+    """Not before an error."""
+    with progress_bar("video", 3) as advance:
+        advance(0, None)  # and there it fails
+    assert capsys.readouterr().err == ""
+    with progress_bar("video", 3) as advance:
+        advance(0, None)
+        advance()
+    assert "1/3" in capsys.readouterr().err

@@ -160,6 +160,9 @@ def test_summary(tmp_path):
     track = np.load(tmp_path / "track.npz")
     assert first["mean_score"] == pytest.approx(track["score"][:, 0].mean())
     assert first["median_sigma"]["x_px"] == pytest.approx(np.sqrt(np.median(track["covariance"][:, 0, 0, 0])))
+    for number, each in enumerate((first, second)):  # where they were seen last
+        moved = report((9, 3)[number], lost=()).displacement[number]
+        assert list(each["last_displacement"].values()) == pytest.approx(moved.tolist())
     assert second["median_sigma"] == {"x_px": None, "y_px": None, "theta_rad": None}  # mostly lost: infinite
     assert found["um_per_px"] == pytest.approx([0.5, 2.0])
     assert found["settings"] == {"size": [31, 31], "input": "a.mp4", "levels": 2, "limit": None, "mask": None}
@@ -278,6 +281,31 @@ def test_memory_does_not_grow_with_the_length(tmp_path):
         finally:
             tracemalloc.stop()
     assert held < 60_000  # of which one record takes 1.4 kB; 500 of them are 700 kB
+
+
+def test_nor_does_that_of_writing_the_results(tmp_path, monkeypatch):
+    """Nor do the results depend on how many frames are looked at together."""
+    peaks, told = [], []
+    monkeypatch.setattr("torch_ecc.io.summary._VALUES", 800)
+    for frames, block in ((100, 1 << 14), (1000, 1 << 14), (1000, 1 << 30)):
+        monkeypatch.setattr("torch_ecc.io.journal._BLOCK", block)
+        out = tmp_path / str(len(peaks))
+        with TrackWriter(out, **WORDS) as writer:
+            for k in range(frames):
+                writer.write(report(k, templates=8, lost=(k % 5,) if k % 7 == 3 else ()))
+            tracemalloc.start()
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        told.append([{k: v for k, v in summary(out).items() if k != "frames_per_s"}, (out / "track.npz").read_bytes()])
+    assert peaks[1] < 1.3 * peaks[0]
+    assert peaks[2] > 3 * peaks[1]
+    (ours, npz), (at_once, npz_at_once) = told[1:]
+    assert npz == npz_at_once
+    for name in ours.keys() - {"per_template"}:
+        assert ours[name] == at_once[name]
+    for one, other in zip(ours["per_template"], at_once["per_template"], strict=True):
+        assert one | {"mean_score": 0, "mean_coverage": 0} == other | {"mean_score": 0, "mean_coverage": 0}
+        assert one["mean_score"] == pytest.approx(other["mean_score"], rel=1e-12)
 
 
 # ---- refused at the door -------------------------------------------------------------------------------------------

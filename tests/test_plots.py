@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from PIL import Image
 
 from torch_ecc import plots
 from torch_ecc.plots import plot_track
+from torch_ecc.plots.envelope import Envelope, thinned
 
 CODES = {
     "status_codes": np.array([0, 1, 2], np.int8),
@@ -111,6 +113,25 @@ def test_long_tracks_are_drawn_as_their_envelope(figure):
     strip = axes["status"].images[0].get_array()
     assert (strip == 2).sum() == 1
     assert strip.shape[1] <= 1500
+
+
+def test_long_tracks_are_read_in_blocks(tmp_path, monkeypatch):
+    """However they are read, the same is drawn; memory does not grow with their length."""
+    data = track(50_000, 2, time_s=np.arange(50_000) / 25, um_matrix=UM)
+    data["status"][10_000:20_000, 1] = 2
+    np.savez(tmp_path / "track.npz", **data | {"score": np.asfortranarray(data["score"])})
+    tracemalloc.start()
+    try:
+        with np.load(tmp_path / "track.npz") as archive:
+            read = thinned(archive)
+        held = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert held < 12e6  # of 15e6 that the file has, several times over
+    monkeypatch.setattr("torch_ecc.plots.envelope._BLOCK", 1 << 30)
+    for ours, at_once in zip(read, thinned(data), strict=True):
+        for one, other in zip(ours, at_once, strict=True) if isinstance(ours, Envelope) else [(ours, at_once)]:
+            np.testing.assert_array_equal(one, other)
 
 
 def test_a_frame_of_huge_sigma_does_not_flatten_the_rest(figure):

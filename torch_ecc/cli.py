@@ -301,15 +301,22 @@ class _Rate(ProgressColumn):
 
 @contextmanager
 def progress_bar(title: str, total: int | None = None, unit: str = "frames") -> Iterator[Callable[..., None]]:
-    """A bar with the rate; yields a function that advances it by one, or sets (done, total) when given them."""
+    """A bar with the rate; yields a function that advances it by one, or sets (done, total) when given them. It shows
+    once something is done: before, there may be an error to tell instead."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(unit), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(title, total=total)
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task(title, total=total)
 
-        def advance(done: int | None = None, out_of: int | None = None) -> None:
-            bar.update(task, advance=1 if done is None else None, completed=done, total=out_of or total)
+    def advance(done: int | None = None, out_of: int | None = None) -> None:
+        if done != 0:
+            bar.start()
+        bar.update(task, advance=1 if done is None else None, completed=done, total=out_of or total)
 
+    try:
         yield advance
+    finally:
+        if bar.live.is_started:
+            bar.stop()
 
 
 def main() -> None:

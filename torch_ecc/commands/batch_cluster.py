@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 PATIENCE = 20.0  # s to wait for a scheduler, and for its first worker
 CLOSING = 3.0  # s that it may take to say goodbye
 GPU = "GPU"  # the resource that a worker with one has
+PROFILE = "distributed.worker.profile.enabled"  # what Dask keeps of a long call grows by the second
 
 
 def need_dask() -> None:
@@ -67,18 +68,20 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _here(workers: int, *, gpu: bool) -> Iterator[Client]:
+    import dask
     from distributed import Client, LocalCluster
 
-    cluster = LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        memory_limit=0,  # frames are streamed: what a recording needs does not grow
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-        resources={GPU: 1} if gpu else None,
-        preload=[__name__],
-    )
+    with dask.config.set({PROFILE: False}):
+        cluster = LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=0,  # frames are streamed: what a recording needs does not grow
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+            resources={GPU: 1} if gpu else None,
+            preload=[__name__],
+        )
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client
 

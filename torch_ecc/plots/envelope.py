@@ -16,7 +16,7 @@ _Array: TypeAlias = NDArray[np.float64]
 BINS = 1500  # more points than this per curve would only be drawn on top of each other
 _FOUND = ("CONVERGED", "MAX_ITERATIONS")  # with every other status the pose is an old one, and is not drawn
 _NEEDED = ("displacement", "covariance", "score", "status", "residual_rms", "status_codes", "status_names")
-_BLOCK = 1 << 16  # templates times frames that are in memory at once
+_BLOCK = 1 << 14  # templates times frames that are in memory at once
 _SAMPLE = 1 << 17  # of them tell what is usual
 
 
