@@ -31,7 +31,7 @@ CONSTANTS = {  # of the Python modules, for the C++
     "packed": ["MOST", "PLANES", "NUMBERS", "MOMENTS"],
     "reference": ["BLOCK", "LEVELS"],
     "sampling": ["ROUNDING"],
-    "solution": ["FLAT", "SUMS"],
+    "solution": ["CLUSTERS", "FLAT", "SUMS"],
     "solver": ["COARSE_TOLERANCE", "SECANT_RANGE", "LARGEST_SCALE", "LONGEST_STEP"],
 }
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.

@@ -106,7 +106,7 @@ def solve(
         return found
     memory, on_cpu = Memory.none(reference) if memory is None else memory, is_cpu(start.device)
     odd = unusual(reference, found, settings, memory.score)
-    if on_cpu and not odd.any():
+    if odd is None:
         return found
     doubted, plain = Doubted.of(engine, reference, image, settings, memory), found._replace(trust=whole(found))
     if on_cpu:  # nowhere else does the host ask which ones
@@ -123,14 +123,19 @@ def solve(
     return each(lambda old, new: old.index_copy(0, doubted.which, new), found._replace(trust=whole(found)), answer)
 
 
-def unusual(reference: Reference, found: Solution, settings: Settings, usual: Tensor) -> Tensor:
+def unusual(reference: Reference, found: Solution, settings: Settings, usual: Tensor) -> Tensor | None:
     """Which templates (B,) have blocks with residuals that would be too much even for noise as it is ``usual`` (B,), or
-    the least there is: others need no scale of this frame's own."""
-    worst = (residual_variance(found.sums) * reference.blocks.enough).amax(1)
-    odd = ~(worst <= OUTLIER * usual_variance(found.normal, found.gain, usual))  # NaN is unusual
-    if is_cpu(worst.device) and not odd.any():
-        return odd
-    return odd & ~(worst <= OUTLIER * least_noise(reference, settings)[:, 0])
+    the least there is: others need no scale of this frame's own. None if the host knows that there are none."""
+    blocks, on_cpu = reference.blocks, is_cpu(usual.device)
+    if found.normal is reference.normal:  # all pixels count
+        worst = (found.sums[:, 6] * blocks.share).amax(1)
+    else:
+        worst = (residual_variance(found.sums) * blocks.enough).amax(1)
+    most = usual_variance(found.normal, found.gain, usual)
+    if on_cpu and all(w <= OUTLIER * m for w, m in zip(worst.tolist(), most.tolist(), strict=True)):
+        return None
+    odd = ~(worst <= OUTLIER * torch.maximum(most, least_noise(reference, settings)[:, 0]))  # NaN is unusual
+    return None if on_cpu and not odd.any() else odd
 
 
 def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
@@ -243,7 +248,7 @@ def compared(doubted: Doubted, variance: Tensor, seen: Tensor, most: Scale) -> t
 def usual_variance(normal: Normal, gain: Tensor, usual: Tensor) -> Tensor:
     """The residual variance (B,) of templates seen with a ``gain`` (B,) whose score s is the ``usual`` (B,) one: the
     share 1 - s^2 of their own."""
-    return (1 - usual * usual) * gain.square() * normal.energy / normal.total.clamp(min=LEAST)
+    return (1 - usual * usual) * gain.square() * normal.contrast
 
 
 def chosen(better: Tensor, new: Solution, old: Solution) -> Solution:
@@ -277,9 +282,8 @@ def excess(variance: Tensor, blocks: Blocks, seen: Tensor, scale: Scale) -> Tens
 def least_noise(reference: Reference, settings: Settings) -> Tensor:
     """Variance (B, 1) that noise has at least: that of the template's, or next to nothing of its contrast; of a sampler
     without prefilter, what it rounds off itself."""
-    contrast = reference.normal.energy / reference.normal.total.clamp(min=LEAST)
     share = LEAST_NOISE if SAMPLERS[settings.interpolation].ring else ROUNDED_OFF
-    least = torch.maximum(reference.noise.of_frame, share**2 * contrast)
+    least = torch.maximum(reference.noise.of_frame, share**2 * reference.normal.contrast)
     return least.to(reference.K.dtype).unsqueeze(1)
 
 

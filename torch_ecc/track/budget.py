@@ -21,6 +21,11 @@ class Budget:
     def __init__(self, credit: Tensor, turn: Tensor, pixels: int, textured: int) -> None:
         self.credit, self.turn, self.frame = credit, turn, max(pixels + SOLVE * textured, LEAST_FRAME)
 
+    def earn(self, income: float) -> None:
+        """Another frame's, if there is not all the credit that there can be."""
+        if float(self.credit) < BURST:
+            self.credit.add_(income)
+
     def left(self) -> bool:
         """Whether there is any credit, which is BURST at most."""
         return float(self.credit.clamp_(max=BURST)) > 0
