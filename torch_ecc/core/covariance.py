@@ -19,7 +19,8 @@ class Sandwich(NamedTuple):
     """What of the covariance of B templates is the same in every frame. ``bread`` (B, 6, 3): rows 1, 2 and 0 of
     Z W G^T off the other columns, and then 2, 0 and 1, whose cross products are its cofactors; ``meat`` = Z W (Z W)^T
     off these, (B, 3, 3), and ``placed``, what of it the template's place is uncertain by; what white noise of unit
-    variance in the template adds to them, ``bread_bias`` and ``meat_bias``; ``place`` (B, 3, 3), see ``Noise``."""
+    variance in the template adds to them, ``bread_bias`` and ``meat_bias``; ``place`` (B, 3, 3), see ``Noise``, and
+    ``alias`` (B, 3, 3), what aliasing adds to that if it all adds up."""
 
     bread: Tensor
     bread_bias: Tensor
@@ -27,16 +28,18 @@ class Sandwich(NamedTuple):
     meat_bias: Tensor
     placed: Tensor
     place: Tensor
+    alias: Tensor
 
 
-def sandwich(noise: Noise, normal: Normal) -> Sandwich:
-    """Of templates with this ``noise`` and these ``normal`` equations."""
+def sandwich(noise: Noise, normal: Normal, interpolation: str = "") -> Sandwich:
+    """Of templates with this ``noise`` and these ``normal`` equations, looked at by a sampler."""
     bread, bias = (
         torch.cat((each.roll(-1, 1), each.roll(-2, 1)), 1).contiguous() for each in (normal.bread, normal.bread_bias)
     )
-    place = torch.zeros_like(normal.meat) if noise.place is None else noise.place
+    alias, none = noise.alias.get(interpolation), torch.zeros_like(normal.meat)
     placed = noise.place_share[:, None, None] * normal.meat
-    return Sandwich(bread, bias, normal.meat, normal.meat_bias, placed, place)
+    known = none if noise.place is None else noise.place, none if alias is None else alias @ alias.mT
+    return Sandwich(bread, bias, normal.meat, normal.meat_bias, placed, *known)
 
 
 def pose_covariance(
@@ -45,7 +48,7 @@ def pose_covariance(
     power: Tensor,
     bias: Tensor,
     scatter: Tensor | None = None,
-    alias: Tensor | None = None,
+    coherent: Tensor | None = None,
 ) -> Tensor:
     """Covariance (B, 3, 3) of poses when one frame's noise has a ``variance`` (B,) and the frame's part of it is seen
     with a gain of the square ``power`` (B,).
@@ -53,7 +56,7 @@ def pose_covariance(
     Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T. The template's
     noise, of variance ``bias`` (B,), is taken out of S, and out of P for its own part P_t: a derivative is
     antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 1, 3): how many times what
-    white noise would do each row of K feels, see ``clinging``; ``alias`` (B, 3, 3): what aliasing adds.
+    white noise would do each row of K feels, see ``clinging``; ``coherent`` (B, 1, 1): see ``coherence``.
     """
     variance, power, bias = (value.view(-1, 1, 1) for value in (variance, power, bias))
     first, second = torch.addcmul(known.bread, bias, known.bread_bias, value=-1).split(3, 1)
@@ -64,7 +67,8 @@ def pose_covariance(
     white = variance / power
     root = (white if scatter is None else scatter * white).sqrt() / determinant
     half = cofactors * root
-    return torch.baddbmm(known.place if alias is None else known.place + alias, torch.bmm(half.mT, meat), half)
+    rest = known.place if coherent is None else torch.addcmul(known.place, known.alias, coherent.square())
+    return torch.baddbmm(rest, torch.bmm(half.mT, meat), half)
 
 
 def coherence(axes: Tensor, sides: Tensor) -> Tensor:

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.blocks import Blocks
-from torch_ecc.core.normal import LEAST, Normal
+from torch_ecc.core.normal import LEAST
 from torch_ecc.core.reference import BLOCK, Reference, each
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust
-from torch_ecc.core.verdict import LEAST_COVERAGE, correlation, detrended, expected_score, within_margin
+from torch_ecc.core.verdict import LEAST_COVERAGE, Number, correlation, detrended, expected_score, within_margin
 
 ROUNDED_OFF = 0.15  # of the contrast, by bilinear interpolation
 OUTLIER = 3.0  # times the variance that is expected of a block: beyond it less and less is believed
@@ -126,15 +126,17 @@ def solve(
 def unusual(reference: Reference, found: Solution, settings: Settings, usual: Tensor) -> Tensor | None:
     """Which templates (B,) have blocks with residuals that would be too much even for noise as it is ``usual`` (B,), or
     the least there is: others need no scale of this frame's own. None if the host knows that there are none."""
-    blocks, on_cpu = reference.blocks, is_cpu(usual.device)
+    blocks, known = reference.blocks, (found.normal.contrast, found.gain, usual)
     if found.normal is reference.normal:  # all pixels count
         worst = (found.sums[:, 6] * blocks.share).amax(1)
     else:
         worst = (residual_variance(found.sums) * blocks.enough).amax(1)
-    most = usual_variance(found.normal, found.gain, usual)
-    if on_cpu and all(w <= OUTLIER * m for w, m in zip(worst.tolist(), most.tolist(), strict=True)):
-        return None
-    odd = ~(worst <= OUTLIER * torch.maximum(most, least_noise(reference, settings)[:, 0]))  # NaN is unusual
+    if on_cpu := is_cpu(usual.device):
+        numbers = zip(worst.tolist(), *(value.tolist() for value in known), strict=True)
+        if all(most <= OUTLIER * usual_variance(*each) for most, *each in numbers):
+            return None
+    expected = torch.maximum(usual_variance(*known), least_noise(reference, settings)[:, 0])
+    odd = ~(worst <= OUTLIER * expected)  # NaN is unusual
     return None if on_cpu and not odd.any() else odd
 
 
@@ -234,8 +236,8 @@ def any_scale(doubted: Doubted) -> Scale:
 
 def usual_scale(doubted: Doubted, gain: Tensor, slip: float) -> Scale:
     """The scale of templates seen with a ``gain`` (n,) if their noise is the usual one."""
-    normal = each(lambda value: value[doubted.which], doubted.reference.normal)
-    noise = usual_variance(normal, gain, doubted.usual).to(doubted.floor.dtype)
+    contrast = doubted.reference.normal.contrast[doubted.which]
+    noise = usual_variance(contrast, gain, doubted.usual).to(doubted.floor.dtype)
     return Scale(noise.unsqueeze(1).maximum(doubted.floor), torch.full_like(doubted.floor, slip))
 
 
@@ -245,10 +247,10 @@ def compared(doubted: Doubted, variance: Tensor, seen: Tensor, most: Scale) -> t
     return scale, excess(variance, doubted.blocks, seen, scale)
 
 
-def usual_variance(normal: Normal, gain: Tensor, usual: Tensor) -> Tensor:
-    """The residual variance (B,) of templates seen with a ``gain`` (B,) whose score s is the ``usual`` (B,) one: the
-    share 1 - s^2 of their own."""
-    return (1 - usual * usual) * gain.square() * normal.contrast
+def usual_variance(contrast: Number, gain: Number, usual: Number) -> Number:
+    """The residual variance of a template of some ``contrast``, seen with a ``gain``, whose score s is the ``usual``
+    one: the share 1 - s^2 of its own. Numbers, or tensors (B,)."""
+    return (1 - usual * usual) * gain * gain * contrast
 
 
 def chosen(better: Tensor, new: Solution, old: Solution) -> Solution:

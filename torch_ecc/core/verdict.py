@@ -54,8 +54,7 @@ class Known(NamedTuple):
     """What the verdict on B templates needs, the same in every frame: ``free`` and ``template_free`` (B,), the degrees
     of freedom of what a residual's square sum is made of, frame and template; ``per_frame`` (B,), one over how many
     frames a template is the mean of; ``clusters`` (B, 9), see ``clinging.scale_of``, None if there are too few blocks;
-    ``share`` (B,), see ``unit_share``; ``sandwich``; ``alias`` (B, 3, 3), what aliasing adds to the covariance at most,
-    None where it does not count."""
+    ``share`` (B,), see ``unit_share``; ``sandwich``, see there."""
 
     free: Tensor
     template_free: Tensor
@@ -63,21 +62,18 @@ class Known(NamedTuple):
     clusters: Tensor | None
     share: Tensor
     sandwich: Sandwich
-    alias: Tensor | None
 
 
 def known_of(reference: Reference, normal: Normal, interpolation: str) -> Known:
     """Of templates of which those pixels count that ``normal`` is about."""
-    noise, alias = reference.noise, reference.noise.alias.get(interpolation)
-    per_frame = noise.frames.reciprocal()
+    noise, per_frame = reference.noise, reference.noise.frames.reciprocal()
     return Known(
         SAMPLERS[interpolation].noise_gain * normal.freedom,
         per_frame * normal.freedom,
         per_frame,
         scale_of(reference.grid, normal),
         unit_share(reference.grid, normal),
-        sandwich(noise, normal),
-        None if alias is None else alias @ alias.mT,
+        sandwich(noise, normal, interpolation),
     )
 
 
@@ -105,8 +101,8 @@ def judge(
     of_template = variance * constant.per_frame
     bias, white = torch.minimum(of_template, reference.noise.power), torch.addcmul(variance, of_template, power)
     scatter, strained = clinging(reference, found, white, constant.clusters)
-    alias = None if constant.alias is None else constant.alias * coherence(axes, reference.grid.sides).square()
-    covariance = pose_covariance(constant.sandwich, variance, power, bias, scatter, alias)
+    coherent = None if settings.interpolation not in reference.noise.alias else coherence(axes, reference.grid.sides)
+    covariance = pose_covariance(constant.sandwich, variance, power, bias, scatter, coherent)
     unobservable = largest_variance(reference.place.lever2, covariance), constant.share * bias
     visible, believed = seen_and_believed(reference, found)
     amounts = visible, score, found.gain, believed, *unobservable, found.error
@@ -242,13 +238,12 @@ def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = 
     Infinite or NaN where the texture leaves a direction open."""
     power, frames = reference.noise.power, reference.noise.frames
     power = power if variance is None else torch.minimum(power, variance / frames)
-    share: Tensor = unit_share(reference.grid, normal) * power
-    return share
+    return unit_share(reference.grid, normal) * power
 
 
 def unit_share(grid: Grid, normal: Normal) -> Tensor:
     """The same (B,) for a noise of variance 1."""
-    return normal.noise_share / max(NOISE_SHARE, 1 - CHANCE / grid.pixels.shape[1] ** 0.5)
+    return normal.noise_share.div(max(NOISE_SHARE, 1 - CHANCE / grid.pixels.shape[1] ** 0.5))
 
 
 def predicted_sigma(reference: Reference, normal: Normal, variance: Tensor) -> Tensor:
