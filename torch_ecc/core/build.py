@@ -32,7 +32,8 @@ CONSTANTS = {  # of the Python modules, for the C++
     "reference": ["BLOCK", "LEVELS"],
     "sampling": ["ROUNDING"],
     "solution": ["CLUSTERS", "FLAT", "SUMS"],
-    "solver": ["COARSE_TOLERANCE", "SECANT_RANGE", "LARGEST_SCALE", "LONGEST_STEP"],
+    "solver": ["COARSE_TOLERANCE"],
+    "step": ["SECANT_RANGE", "LARGEST_SCALE", "LONGEST_STEP"],
 }
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.
 MATHS = ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math", "-ffp-contract=fast"]
