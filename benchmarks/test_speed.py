@@ -18,7 +18,8 @@ from work import WORKS, Work
 
 import torch_ecc as te
 from torch_ecc.core.sampling import make_sampler
-from torch_ecc.core.solver import State, iterate
+from torch_ecc.core.solver import iterate
+from torch_ecc.core.step import State
 
 SAMPLERS = ("bilinear", "bspline3", "bspline5")
 BACKENDS = options()

@@ -10,9 +10,9 @@ from scatter import Draws, least, oracle, scatter
 from sequences import track_path, under_light
 
 from torch_ecc import Status, align
+from torch_ecc.core.covariance import interpolation_error
 from torch_ecc.core.pose import inverse, transform, turn
 from torch_ecc.core.sampling import SAMPLERS
-from torch_ecc.core.verdict import interpolation_error
 from torch_ecc.paper.bound import cramer_rao, rounding
 from torch_ecc.paper.methods import prepared
 from torch_ecc.paper.scheme import Harmonic

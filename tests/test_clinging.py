@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_ecc import Status, align, prepare
 from torch_ecc.core.blocks import STRAINS
-from torch_ecc.core.clinging import clinging, patterns, without_strain
+from torch_ecc.core.clinging import clinging, patterns, scale_of, without_strain
 from torch_ecc.core.native import solve as native
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import solve
@@ -110,5 +110,5 @@ def test_engines_agree_on_what_clings_together():
         values = []
         for found in (one, other):
             ones = torch.ones_like(found.gain)
-            values.append(clinging(reference, found, 1e-3 * ones, 2 * ones))
+            values.append(clinging(reference, found, 1e-3 * ones, scale_of(reference.grid, found.normal)))
         torch.testing.assert_close(values[0].scatter, values[1].scatter, rtol=2e-2, atol=1e-4)

@@ -9,7 +9,7 @@ from engines import BACKENDS, CRITERIA, ENGINES, FRAME, SCENE, Problem, compiled
 from torch_ecc import PaperECC, Status, align, prepare
 from torch_ecc.core import solver
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solver import LARGEST_SCALE, LONGEST_STEP, State, advance, secant
+from torch_ecc.core.step import LARGEST_SCALE, LONGEST_STEP, State, advance, secant
 
 LEVER = torch.tensor([[1.0, 1.0, 30.0]], dtype=torch.float64)
 ENGINE = [pytest.param(solver, id="page"), *(pytest.param(e, marks=compiled, id=n) for n, e in ENGINES.items())]

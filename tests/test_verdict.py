@@ -32,7 +32,10 @@ def test_both_correlations_are_what_they_say(criterion, seed):
     g = t + 30 * torch.randn(t.shape, generator=draw) + 80 * reference.uv[0, 0] - 50 * reference.uv[0, 1]
     _, sums, total = summed(part, g[None], part.weight)
     torch.testing.assert_close(total[:, :10], sums.double().sum(-1), rtol=1e-5, atol=1e-3)
-    torch.testing.assert_close(total[:, 10:], sums[:, 7:].double().square().sum(-1), rtol=1e-5, atol=0)
+    effect = sums[0, 7:].double().view(3, *part.grid.blocks)
+    clusters = effect, effect.sum(2), effect.sum(1)
+    squares = torch.cat([each.square().flatten(1).sum(1) for each in clusters])
+    torch.testing.assert_close(total[0, 10:], squares, rtol=1e-5, atol=0)
     one = torch.ones_like(u)
     t, g = t.double(), g.double()
     plain, off = correlation(part.normal, total), detrended(part.normal, total)

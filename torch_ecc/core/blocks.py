@@ -21,7 +21,7 @@ class Blocks(NamedTuple):
     """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean and of
     its ``square``, the mean square of the texture's slopes, or of those around if that is more, ``slope``; and which of
     those that hold pixels enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``:
-    either."""
+    either; ``share``: what their weighted sums are to be multiplied by for a mean, 0 of the others."""
 
     weight: Tensor
     t: Tensor
@@ -30,6 +30,7 @@ class Blocks(NamedTuple):
     flat: Tensor
     steep: Tensor
     enough: Tensor
+    share: Tensor
 
 
 # By what parts of a target, at (x, y) about its centre, may move other than as one, and whether that is half a turn:
@@ -70,7 +71,8 @@ def blocks_of(reference: Reference) -> Blocks:
     slope = torch.maximum(slope, around).flatten(1)
     enough = count > HALF_FULL * count.amax(1, keepdim=True)
     middle = torch.where(enough, slope, torch.nan).nanmedian(1, keepdim=True).values
-    return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle), enough)
+    share = torch.where(enough, 1 / count, 0.0)
+    return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle), enough, share)
 
 
 def parts_of(reference: Reference) -> Parts:

@@ -31,8 +31,9 @@ CONSTANTS = {  # of the Python modules, for the C++
     "packed": ["MOST", "PLANES", "NUMBERS", "MOMENTS"],
     "reference": ["BLOCK", "LEVELS"],
     "sampling": ["ROUNDING"],
-    "solution": ["FLAT", "SUMS"],
-    "solver": ["COARSE_TOLERANCE", "SECANT_RANGE", "LARGEST_SCALE", "LONGEST_STEP"],
+    "solution": ["CLUSTERS", "FLAT", "SUMS"],
+    "solver": ["COARSE_TOLERANCE"],
+    "step": ["SECANT_RANGE", "LARGEST_SCALE", "LONGEST_STEP"],
 }
 # Sums may be reordered and vectorised; NaN and infinity keep their meaning.
 MATHS = ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math", "-ffp-contract=fast"]

@@ -17,10 +17,10 @@ from torch import Tensor
 from torch_ecc.core.ambient import constant
 from torch_ecc.core.blocks import STRAINS, Parts
 from torch_ecc.core.criteria import safe_inverse
-from torch_ecc.core.normal import LEAST
-from torch_ecc.core.reference import Fields, Reference, each
+from torch_ecc.core.normal import LEAST, Normal
+from torch_ecc.core.reference import Fields, Grid, Reference, each
 from torch_ecc.core.sampling import is_cpu
-from torch_ecc.core.solution import Solution
+from torch_ecc.core.solution import SUMS, Solution, clustered
 
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 SURE = 3.0  # standard deviations by which lines must scatter more than blocks do: lines are few, and scatter by chance
@@ -29,46 +29,54 @@ BY_CHANCE = 14.0  # so large may the square of 7 strains over its variance be by
 
 
 class Clinging(NamedTuple):
-    """``scatter`` (B, 3 or 1): variance of noise as each row of K feels it; ``strained`` (B, 3, 3): covariance of
-    what the pose of a strained target may be off by, in the template's axes; None if it is not strained."""
+    """``scatter`` (B, 1, 3): by how many times more than white noise each row of K feels the residuals, at least 1;
+    ``strained`` (B, 3, 3): covariance of what the pose of a strained target may be off by, in the template's axes.
+    None where nothing clings together, or nobody can tell."""
 
-    scatter: Tensor
+    scatter: Tensor | None
     strained: Tensor | None
 
 
-def clinging(reference: Reference, found: Solution, variance: Tensor, of_both: Tensor) -> Clinging:
-    """What clings together in the residuals of B templates whose template and frame have noise of ``variance`` (B,) if
-    it is white, ``of_both`` (B,) times as much together; the scatter is never less."""
-    columns, occupied = reference.K.shape[1], reference.grid.occupied
-    if occupied < FEW_BLOCKS * columns:  # too few to tell a scatter from
-        return Clinging(variance.unsqueeze(1), None)
-    free = occupied / (occupied - columns)  # blocks are not free: the fit has made their sum zero
-    white, grid = found.normal.white * of_both.unsqueeze(1), reference.grid.blocks
-    scatter = torch.maximum(found.total[:, 10:].div(white).mul_(free), variance.unsqueeze(1))
-    certain = in_lines(found.sums[:, 7:], white, scatter, grid)[1]
-    on_cpu = is_cpu(certain.device)
+def clinging(reference: Reference, found: Solution, white: Tensor, scale: Tensor | None) -> Clinging:
+    """What clings together in the residuals of B templates whose template and frame have noise of variance ``white``
+    (B,) together if it is that, with clusters of a ``scale_of``."""
+    if scale is None:
+        return Clinging(None, None)
+    scatter, certain = scattered(found.total[:, SUMS:], white, scale)
+    on_cpu = is_cpu(white.device)
     if on_cpu and not bool(certain.any()):
         return Clinging(scatter, None)
     certain = certain.flatten(1).any(1)
     index = certain.nonzero()[:, 0] if on_cpu else torch.arange(len(certain), device=certain.device)
     effect, strained = without_strain(_at(index, reference.parts), _at(index, found))
-    certain, white = certain[index], white[index]
-    blocks = effect.square().sum(2, dtype=white.dtype).div(white).mul_(free)
-    blocks = torch.maximum(blocks, variance[index].unsqueeze(1))
-    lines, more = in_lines(effect, white, blocks, grid)
-    most = torch.where(more, lines, blocks.unsqueeze(2)).amax(2)
-    most = torch.where(certain[:, None], most, scatter[index])
+    certain, grid = certain[index], reference.grid.blocks
+    ratio = clustered(effect.to(white.dtype), grid)
+    blocks, more = scattered(ratio, white[index], scale[index])
+    lines = (ratio * scale[index] / white[index, None]).view(-1, 3, 3) * _shares(grid, white.dtype, white.device)[1]
+    most = torch.where(more, lines, blocks).amax(1, keepdim=True)
+    most = torch.where(certain[:, None, None], most, scatter[index])
     strained = torch.where(certain[:, None, None], strained, 0.0)
     none = strained.new_zeros(len(scatter), 3, 3)
     return Clinging(scatter.index_copy(0, index, most), none.index_copy(0, index, strained))
 
 
-def in_lines(effect: Tensor, white: Tensor, scatter: Tensor, grid: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Scatter (B, 3, 2) as of rows and of columns of blocks with an ``effect`` (B, 3, blocks), and whether it is for
-    certain more than the ``scatter`` (B, 3) of blocks."""
-    member, kind, sure, free = _lines(grid, effect.dtype, effect.device)
-    lines = torch.matmul(torch.matmul(effect, member).square_(), kind).div(white.unsqueeze(2))
-    return lines * free, lines > sure * scatter.unsqueeze(2)
+def scale_of(grid: Grid, normal: Normal) -> Tensor | None:
+    """What takes square sums (B, 9) over clusters, see ``solution.clustered``, to the scatter that they tell, times
+    white noise's: of lines, to the least that would be so by chance. None if blocks are too few to tell."""
+    columns, occupied = normal.inverse.shape[1], grid.occupied
+    if occupied < FEW_BLOCKS * columns:
+        return None
+    free = occupied / (occupied - columns)  # blocks are not free: the fit has made their sum zero
+    sure, _ = _shares(grid.blocks, normal.white.dtype, normal.white.device)
+    return (normal.white.new_tensor([[free], [1], [1]]) / (sure * normal.white[:, None])).flatten(1)
+
+
+def scattered(squares: Tensor, white: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """How much more the square sums (B, 9) over blocks tell than white noise of variance ``white`` (B,) makes of them,
+    (B, 1, 3), and where (B, 3, 3) those over lines tell more than that for certain; over blocks they never do."""
+    ratio = (squares * scale / white.unsqueeze(1)).view(-1, 3, 3)
+    scatter = ratio[:, :1].clamp(min=1.0)
+    return scatter, ratio > scatter
 
 
 def without_strain(parts: Parts, found: Solution) -> tuple[Tensor, Tensor]:
@@ -130,17 +138,14 @@ def _turning(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 @constant
-def _lines(grid: tuple[int, int], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
-    """Of a grid of blocks: which rows and columns they are in, (blocks, rows + columns); which of these are rows, and
-    which columns, (rows + columns, 2); how many times that of blocks their scatter is for certain, (2,); and what makes
-    up for so few, (2,).
+def _shares(grid: tuple[int, int], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Of blocks, and of rows and columns of a grid of them, (3, 1) each: how many times the scatter of blocks theirs is
+    for certain; and that times what makes up for so few.
 
     The fit has made the sum of n lines zero, and an error over a scatter of so few has Student's distribution, with the
     variance (n - 1) / (n - 3).
     """
-    rows, columns = (torch.eye(n, dtype=dtype, device=device) for n in grid)
-    member = torch.cat((rows.repeat_interleave(grid[1], 0), columns.repeat(grid[0], 1)), 1)
-    kind = torch.eye(2, dtype=dtype, device=device).repeat_interleave(torch.tensor(grid, device=device), 0)
     sure, free = [1 + SURE * (2 / n) ** 0.5 for n in grid], [n / max(n - 3, 1) for n in grid]
-    numbers = torch.tensor([sure, free], dtype=dtype, device=device)
-    return member, kind, numbers[0], numbers[1]
+    most = [s * f for s, f in zip(sure, free, strict=True)]
+    both = torch.tensor([[1.0, *sure], [1.0, *most]], dtype=dtype, device=device)[:, :, None]
+    return both[0], both[1]

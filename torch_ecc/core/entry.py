@@ -42,7 +42,7 @@ def call(
         raise ValueError(
             f"solve: expected start ({count}, 3), image (1 or {count}, 1, H, W), got {start.shape}, {image.shape}"
         )
-    stride, start = image.stride(), start.contiguous()
+    stride, start = image.stride(), start if start.is_contiguous() else start.contiguous()
     if stride[3] != 1 or image.is_neg():
         image = image.resolve_neg().contiguous()
         stride = image.stride()

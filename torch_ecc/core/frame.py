@@ -58,8 +58,7 @@ def as_image(where: str, name: str, image: object, device: torch.device | str | 
     if channels not in (1, 3, 4):
         hint = " (channels last? use permute(2, 0, 1))" if shape[-1] in (1, 3, 4) else ""
         raise ValueError(f"{where}: {name} must have 1, 3 or 4 channels, got {shape}{hint}")
-    while image.dim() < 4:
-        image = image.unsqueeze(0)
+    image = image.view(*(1,) * (4 - len(shape)), *shape)
     if channels == 1 and dtype in KEPT:
         return image if device is None or image.device == device else image.to(device=device)
     gray = image.to(device=device, dtype=torch.float32)

@@ -31,8 +31,8 @@ class Normal(NamedTuple):
     columns, and what white noise of unit variance in the template adds to them (errors in variables), ``bread_bias``
     and ``meat_bias``; ``noise_share`` (B,): the largest part of the bread that such noise can be, in any direction;
     ``white`` (B, 3): the square sums of the first rows of K; ``total`` (B,) of the weights, and ``freedom`` (B,), the
-    share of it that fitted columns leave; ``energy`` (B,) the weighted square sum of t off its mean; ``gram`` as in
-    ``Moments``."""
+    share of it that fitted columns leave; ``energy`` (B,) the weighted square sum of t off its mean, and ``contrast``
+    (B,), its mean; ``gram`` as in ``Moments``."""
 
     matrix: Tensor
     inverse: Tensor
@@ -45,6 +45,7 @@ class Normal(NamedTuple):
     total: Tensor
     freedom: Tensor
     energy: Tensor
+    contrast: Tensor
     gram: Tensor
 
 
@@ -62,6 +63,7 @@ def normal_equations(sums: Moments) -> Normal:
         errors_in_variables(q) * response for q, response in zip(sums.noise.unbind(1), NOISE_RESPONSE, strict=True)
     )
     total, along, count = sums.gram[:, 0, 0], sums.gram[:, 0, 3], sums.number.clamp(min=1)
+    energy = (sums.gram[:, 3, 3] - along * along / total.clamp(min=LEAST)).clamp(min=0)
     return Normal(
         matrix=sums.normal,
         inverse=inverse,
@@ -73,6 +75,7 @@ def normal_equations(sums: Moments) -> Normal:
         white=spread.diagonal(dim1=1, dim2=2).clamp(min=LEAST),
         total=total,
         freedom=(total * (count - inverse.shape[-1]).clamp(min=1) / count).clamp(min=LEAST),
-        energy=(sums.gram[:, 3, 3] - along * along / total.clamp(min=LEAST)).clamp(min=0),
+        energy=energy,
+        contrast=energy / total.clamp(min=LEAST),
         gram=sums.gram,
     )

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.reference import BLOCK, LEVELS, Reference
-from torch_ecc.core.solution import SUMS
+from torch_ecc.core.solution import CLUSTERS, SUMS
 
 LANES = 16  # pixels of the widest vector that an engine reads rows in: their pitch is a multiple of it
 MOST = 10  # columns
@@ -50,7 +50,7 @@ class Packed(_Packed):
         blocks = -(-height // BLOCK) * -(-self.widths[0] // BLOCK)
         sums = new((count, SUMS, blocks), dtype=torch.float32)
         single = new(count), new(count, dtype=torch.int64), new(count)
-        return [new((count, 3)), *single, sums, new((count, SUMS + 3)), new((count, MOMENTS))]
+        return [new((count, 3)), *single, sums, new((count, SUMS + CLUSTERS)), new((count, MOMENTS))]
 
     @cached_property
     def pixels(self) -> int:

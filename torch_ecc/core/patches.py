@@ -12,11 +12,11 @@ from torch import Tensor
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.criteria import Criterion, make_criterion
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
-from torch_ecc.core.pose import pose_dtype, turn
+from torch_ecc.core.pose import pose_dtype
 from torch_ecc.core.reference import MARGIN, SMALLEST, Reference, prepare
 from torch_ecc.core.sampling import pad
 from torch_ecc.core.sight import eroded
-from torch_ecc.core.verdict import LARGEST_SIGMA, largest_variance, noise_share, pose_covariance
+from torch_ecc.core.verdict import predicted_sigma
 
 QUANTISATION = 1 / 12  # variance of rounding to whole grey levels
 
@@ -149,9 +149,4 @@ def texture(
     sigma = level if noise is None else torch.full_like(level, noise)
     rounding = 0.0 if require_tensor("texture", "frame", frame).is_floating_point() else QUANTISATION
     variance = sigma.to(patches.centers) ** 2 + rounding
-    none = torch.zeros_like(variance)
-    covariance = pose_covariance(reference, reference.normal, variance, none + 2, turn(none))
-    predicted = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    observable = largest_variance(reference, covariance) <= LARGEST_SIGMA**2
-    observable &= noise_share(reference, reference.normal, variance) <= 1
-    return torch.where(observable[:, None], predicted, torch.inf)
+    return predicted_sigma(reference, reference.normal, variance)

@@ -15,7 +15,7 @@ Conventions of the whole package, written here once:
 
 from __future__ import annotations
 
-from math import tau
+from math import pi, tau
 from typing import TYPE_CHECKING
 
 import torch
@@ -80,9 +80,7 @@ def retract(pose: Tensor, increment: Tensor) -> Tensor:
 
 def turn(theta: Tensor) -> Tensor:
     """Turns an increment of a pose with its body, x and y by theta of eq. (2): (...) -> (..., 3, 3)."""
-    cosine_sine = torch.stack((theta.cos(), theta.sin()), -1).view(-1, 2)
-    still, moving = _turn(theta.dtype, theta.device)
-    return torch.addmm(still, cosine_sine, moving).view(*theta.shape, 3, 3)
+    return _turned(theta.view(*theta.shape, 1, 1))
 
 
 def ahead(pose: Tensor, step: Tensor) -> Tensor:
@@ -90,8 +88,8 @@ def ahead(pose: Tensor, step: Tensor) -> Tensor:
 
     W(pose) o W(last)^-1 o W(pose), exact for a constant turn about any point: the step turns by its own angle.
     """
-    turned = torch.bmm(turn(step[..., 2]).view(-1, 3, 3), step.reshape(-1, 3, 1))
-    return pose + turned.view(step.shape)
+    start, step = pose.reshape(-1, 3, 1), step.reshape(-1, 3, 1)
+    return torch.baddbmm(start, _turned(step[:, 2:]), step).view(pose.shape)
 
 
 def unwrap(theta: Tensor, reference: Tensor) -> Tensor:
@@ -129,9 +127,15 @@ def from_se2(se2: Se2) -> Tensor:
     return from_matrix(se2.matrix())
 
 
+def _turned(theta: Tensor) -> Tensor:
+    """``turn`` by (..., 1, 1): (..., 3, 3)."""
+    phase, sign = _turn(theta.dtype, theta.device)
+    return torch.addcmul(phase, theta, sign).sin()
+
+
 @constant
 def _turn(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The constant part (9,) of ``turn``, and what cosine and sine are multiplied with (2, 9)."""
-    still = torch.tensor([0, 0, 0, 0, 0, 0, 0, 0, 1], dtype=dtype, device=device)
-    moving = torch.tensor([[1, 0, 0, 0, 1, 0, 0, 0, 0], [0, 1, 0, -1, 0, 0, 0, 0, 0]], dtype=dtype, device=device)
-    return still, moving
+    """What ``turn`` takes the sine of at theta = 0, (3, 3), and the sign with which theta adds to it: one operation for
+    cosine, sine, 0 and 1, all exact at 0."""
+    phase = torch.diag(torch.full((3,), pi / 2, dtype=dtype, device=device))
+    return phase, torch.tensor([[1, 1, 0], [-1, 1, 0], [0, 0, 0]], dtype=dtype, device=device)

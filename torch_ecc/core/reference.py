@@ -35,6 +35,7 @@ from torch_ecc.core.sampling import SAMPLERS, aliasing, blur, gradients, pad
 
 if TYPE_CHECKING:
     from torch_ecc.core.packed import Packed
+    from torch_ecc.core.verdict import Known
 
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
 ENOUGH = 1500  # pixels of a template tell well where to go; the first iterations leave out others in x and y
@@ -141,6 +142,11 @@ class Reference(_Groups):
     def parts(self) -> Parts:
         """What each block adds to the normal equations: made once, if it is needed."""
         return parts_of(self) if torch.compiler.is_compiling() else self._kept_parts
+
+    @cached_property
+    def verdicts(self) -> dict[str, Known]:
+        """What the verdict on them needs, by sampler: see ``verdict.known``."""
+        return {}
 
     @cached_property
     @lasting

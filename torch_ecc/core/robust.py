@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.blocks import Blocks
-from torch_ecc.core.normal import LEAST, Normal
+from torch_ecc.core.normal import LEAST
 from torch_ecc.core.reference import BLOCK, Reference, each
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust
-from torch_ecc.core.verdict import LEAST_COVERAGE, correlation, detrended, expected_score, within_margin
+from torch_ecc.core.verdict import LEAST_COVERAGE, Number, correlation, detrended, expected_score, within_margin
 
 ROUNDED_OFF = 0.15  # of the contrast, by bilinear interpolation
 OUTLIER = 3.0  # times the variance that is expected of a block: beyond it less and less is believed
@@ -106,7 +106,7 @@ def solve(
         return found
     memory, on_cpu = Memory.none(reference) if memory is None else memory, is_cpu(start.device)
     odd = unusual(reference, found, settings, memory.score)
-    if on_cpu and not odd.any():
+    if odd is None:
         return found
     doubted, plain = Doubted.of(engine, reference, image, settings, memory), found._replace(trust=whole(found))
     if on_cpu:  # nowhere else does the host ask which ones
@@ -123,14 +123,21 @@ def solve(
     return each(lambda old, new: old.index_copy(0, doubted.which, new), found._replace(trust=whole(found)), answer)
 
 
-def unusual(reference: Reference, found: Solution, settings: Settings, usual: Tensor) -> Tensor:
+def unusual(reference: Reference, found: Solution, settings: Settings, usual: Tensor) -> Tensor | None:
     """Which templates (B,) have blocks with residuals that would be too much even for noise as it is ``usual`` (B,), or
-    the least there is: others need no scale of this frame's own."""
-    worst = (residual_variance(found.sums) * reference.blocks.enough).amax(1)
-    odd = ~(worst <= OUTLIER * usual_variance(found.normal, found.gain, usual))  # NaN is unusual
-    if is_cpu(worst.device) and not odd.any():
-        return odd
-    return odd & ~(worst <= OUTLIER * least_noise(reference, settings)[:, 0])
+    the least there is: others need no scale of this frame's own. None if the host knows that there are none."""
+    blocks, known = reference.blocks, (found.normal.contrast, found.gain, usual)
+    if found.normal is reference.normal:  # all pixels count
+        worst = (found.sums[:, 6] * blocks.share).amax(1)
+    else:
+        worst = (residual_variance(found.sums) * blocks.enough).amax(1)
+    if on_cpu := is_cpu(usual.device):
+        numbers = zip(worst.tolist(), *(value.tolist() for value in known), strict=True)
+        if all(most <= OUTLIER * usual_variance(*each) for most, *each in numbers):
+            return None
+    expected = torch.maximum(usual_variance(*known), least_noise(reference, settings)[:, 0])
+    odd = ~(worst <= OUTLIER * expected)  # NaN is unusual
+    return None if on_cpu and not odd.any() else odd
 
 
 def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
@@ -229,8 +236,8 @@ def any_scale(doubted: Doubted) -> Scale:
 
 def usual_scale(doubted: Doubted, gain: Tensor, slip: float) -> Scale:
     """The scale of templates seen with a ``gain`` (n,) if their noise is the usual one."""
-    normal = each(lambda value: value[doubted.which], doubted.reference.normal)
-    noise = usual_variance(normal, gain, doubted.usual).to(doubted.floor.dtype)
+    contrast = doubted.reference.normal.contrast[doubted.which]
+    noise = usual_variance(contrast, gain, doubted.usual).to(doubted.floor.dtype)
     return Scale(noise.unsqueeze(1).maximum(doubted.floor), torch.full_like(doubted.floor, slip))
 
 
@@ -240,10 +247,10 @@ def compared(doubted: Doubted, variance: Tensor, seen: Tensor, most: Scale) -> t
     return scale, excess(variance, doubted.blocks, seen, scale)
 
 
-def usual_variance(normal: Normal, gain: Tensor, usual: Tensor) -> Tensor:
-    """The residual variance (B,) of templates seen with a ``gain`` (B,) whose score s is the ``usual`` (B,) one: the
-    share 1 - s^2 of their own."""
-    return (1 - usual * usual) * gain.square() * normal.energy / normal.total.clamp(min=LEAST)
+def usual_variance(contrast: Number, gain: Number, usual: Number) -> Number:
+    """The residual variance of a template of some ``contrast``, seen with a ``gain``, whose score s is the ``usual``
+    one: the share 1 - s^2 of its own. Numbers, or tensors (B,)."""
+    return (1 - usual * usual) * gain * gain * contrast
 
 
 def chosen(better: Tensor, new: Solution, old: Solution) -> Solution:
@@ -277,9 +284,8 @@ def excess(variance: Tensor, blocks: Blocks, seen: Tensor, scale: Scale) -> Tens
 def least_noise(reference: Reference, settings: Settings) -> Tensor:
     """Variance (B, 1) that noise has at least: that of the template's, or next to nothing of its contrast; of a sampler
     without prefilter, what it rounds off itself."""
-    contrast = reference.normal.energy / reference.normal.total.clamp(min=LEAST)
     share = LEAST_NOISE if SAMPLERS[settings.interpolation].ring else ROUNDED_OFF
-    least = torch.maximum(reference.noise.of_frame, share**2 * contrast)
+    least = torch.maximum(reference.noise.of_frame, share**2 * reference.normal.contrast)
     return least.to(reference.K.dtype).unsqueeze(1)
 
 

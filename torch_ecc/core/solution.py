@@ -14,6 +14,7 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 
 SUMS = 10  # rows of ``summed``
+CLUSTERS = 9  # square sums of the last three of them, see ``clustered``
 FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 
 
@@ -28,9 +29,9 @@ class Trust(NamedTuple):
 class Solution(NamedTuple):
     """What an engine answers with, of B templates: ``pose`` (B, 3); ``error`` (B,), the predicted remaining error in px
     at the farthest pixel; ``iterations`` (B,); of the last look the patch's ``gain`` (B,), ``sums`` (B, 10, blocks), in
-    every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 3) over the blocks, as they are trusted, with
-    that of the squares of the last three, and the ``normal`` equations of the pixels that count: in sight, and as their
-    blocks are trusted. A gain or total not finite is 0. ``trust`` (B, blocks) in these, None if it is whole."""
+    every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 9) over the blocks, as they are trusted, with
+    what the last three have in ``clustered``, and the ``normal`` equations of the pixels that count: in sight, and as
+    their blocks are trusted. A gain or total not finite is 0. ``trust`` (B, blocks) in these, None if it is whole."""
 
     pose: Tensor
     error: Tensor
@@ -69,8 +70,14 @@ def summed(
     rough = power > FLAT * (power + mean.square() * level)
     sums[:, 1:6] *= rough[:, None, None]
     counted = sums if trusted is None else torch.cat((sums[:, :7] * trusted[:, None], sums[:, 7:]), 1)
-    total = torch.cat((counted.sum(-1, dtype=dtype), sums[:, 7:].to(dtype).square().sum(-1)), 1)
+    total = torch.cat((counted.sum(-1, dtype=dtype), clustered(sums[:, 7:].to(dtype), grid.blocks)), 1)
     return gain.to(dtype).nan_to_num_(0.0, 0.0, 0.0), sums, total.nan_to_num_(0.0, 0.0, 0.0)
+
+
+def clustered(effect: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Square sums (B, 9) of an ``effect`` (B, 3, blocks) over blocks, over rows and over columns of their ``grid``."""
+    lines = effect.unflatten(2, grid)
+    return torch.cat([each.square().sum(2) for each in (effect, lines.sum(3), lines.sum(2))], 1)
 
 
 def counted_pixels(reference: Reference, visible: Tensor | None, trusted: Tensor | None) -> Tensor | None:

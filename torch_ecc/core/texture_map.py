@@ -19,10 +19,9 @@ from torch_ecc.core.frame import as_gray, require_tensor
 from torch_ecc.core.noise import INSTRUMENT_BLUR, LEAST_NOISE, Noise, wiener_weight
 from torch_ecc.core.normal import Moments, normal_equations
 from torch_ecc.core.patches import QUANTISATION, Size, as_size
-from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import MARGIN, Grid, Place, Reference
 from torch_ecc.core.sampling import blur, clipped, gradients, noise_samples, pad
-from torch_ecc.core.verdict import LARGEST_SIGMA, largest_variance, noise_share, pose_covariance
+from torch_ecc.core.verdict import predicted_sigma
 
 MOST_PLACES = 16_000  # of a map
 FINENESS = 10  # steps per side of a window
@@ -130,10 +129,7 @@ def _predicted(gray: Tensor, windows: _Windows, rounding: float) -> Tensor:
     place = Place(torch.empty(0), torch.empty(0), lever2.sqrt(), lever2, torch.empty(0))
     reference = cast(Reference, _Judged(Noise.of(level), grid, place))
     variance = level.square() + rounding
-    covariance = pose_covariance(reference, normal, variance, none + 2, turn(none))
-    observable = largest_variance(reference, covariance) <= LARGEST_SIGMA**2
-    observable &= noise_share(reference, normal, variance) <= 1
-    return torch.where(observable[:, None], covariance.diagonal(dim1=1, dim2=2).sqrt(), torch.inf)
+    return predicted_sigma(reference, normal, variance)
 
 
 def _moments(wide: Tensor, noise: Tensor, windows: _Windows) -> Moments:

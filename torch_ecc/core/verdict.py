@@ -5,19 +5,21 @@ It is made for every frame, of few numbers: what can be known before is, and on 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from torch_ecc.core.ambient import constant
-from torch_ecc.core.clinging import clinging
+from torch_ecc.core.ambient import constant, lasting
+from torch_ecc.core.clinging import clinging, scale_of
+from torch_ecc.core.covariance import Sandwich, coherence, largest_variance, pose_covariance, sandwich
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.pose import turn
-from torch_ecc.core.reference import Reference
+from torch_ecc.core.reference import Grid, Reference
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution
@@ -35,7 +37,7 @@ PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light i
 
 Number = TypeVar("Number", float, Tensor)
 
-# The tests of ``decide`` in their order, and what the first one that fails tells.
+# The tests of ``verdict`` in their order, and what the first one that fails tells.
 VERDICTS = (
     (Status.OUT_OF_VIEW, Reason.OUT_OF_VIEW),  # too little of the template's weight lies in the frame
     (Status.LOST, Reason.UNLIKE),  # what is believed of it does not look like the template
@@ -48,51 +50,95 @@ VERDICTS = (
 )
 
 
+class Known(NamedTuple):
+    """What the verdict on B templates needs, the same in every frame: ``free`` and ``template_free`` (B,), the degrees
+    of freedom of what a residual's square sum is made of, frame and template; ``per_frame`` (B,), one over how many
+    frames a template is the mean of; ``clusters`` (B, 9), see ``clinging.scale_of``, None if there are too few blocks;
+    ``share`` (B,), see ``unit_share``; ``sandwich``, see there."""
+
+    free: Tensor
+    template_free: Tensor
+    per_frame: Tensor
+    clusters: Tensor | None
+    share: Tensor
+    sandwich: Sandwich
+
+
+def known_of(reference: Reference, normal: Normal, interpolation: str) -> Known:
+    """Of templates of which those pixels count that ``normal`` is about."""
+    noise, per_frame = reference.noise, reference.noise.frames.reciprocal()
+    return Known(
+        SAMPLERS[interpolation].noise_gain * normal.freedom,
+        per_frame * normal.freedom,
+        per_frame,
+        scale_of(reference.grid, normal),
+        unit_share(reference.grid, normal),
+        sandwich(noise, normal, interpolation),
+    )
+
+
+def known(reference: Reference, normal: Normal, interpolation: str) -> Known:
+    """The same; made once where all pixels count."""
+    if normal is not reference.normal or torch.compiler.is_compiling():
+        return known_of(reference, normal, interpolation)
+    kept = reference.verdicts
+    if interpolation not in kept:
+        kept[interpolation] = lasting(known_of)(reference, normal, interpolation)
+    return kept[interpolation]
+
+
 def judge(
     reference: Reference, found: Solution, start: Tensor, settings: Settings, origin: Tensor | None = None
 ) -> Estimate:
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back. ``displacement`` counts from
     ``origin`` (B, 3), by default the start."""
-    normal, total, pose = found.normal, found.total, found.pose
-    on_cpu = is_cpu(pose.device)
-    match = score = correlation(normal, total)
-    if not on_cpu or min(score.tolist()) < settings.min_score:
-        match = torch.maximum(score, detrended(normal, total))  # light alone must not make a stranger of the template
-    power, error, axes = found.gain.square(), total[:, 6], turn(pose[:, 2])
-    of_both = 1 + power * reference.noise.place_share  # variance of template and frame together
+    normal, total, pose, axes = found.normal, found.total, found.pose, turn(found.pose.select(1, 2))
+    constant = known(reference, normal, settings.interpolation)
+    power, error, score = found.gain.square(), total.select(1, 6), correlation(normal, total)
     # One image's noise v: of the residuals' mean square the template's part is gain^2 v / frames, the frame's, sampled,
     # NG v.
-    of_template = power / reference.noise.frames
-    variance = error / (of_template + SAMPLERS[settings.interpolation].noise_gain).mul_(normal.freedom)
-    scatter, strained = clinging(reference, found, variance, of_template.add_(1))
-    alias = interpolation_error(reference, axes, settings.interpolation)
-    covariance = pose_covariance(reference, normal, variance, of_both / power, axes, scatter, alias)
+    variance = error / torch.addcmul(constant.free, power, constant.template_free)
+    of_template = variance * constant.per_frame
+    bias, white = torch.minimum(of_template, reference.noise.power), torch.addcmul(variance, of_template, power)
+    scatter, strained = clinging(reference, found, white, constant.clusters)
+    coherent = None if settings.interpolation not in reference.noise.alias else coherence(axes, reference.grid.sides)
+    covariance = pose_covariance(constant.sandwich, variance, power, bias, scatter, coherent)
+    unobservable = largest_variance(reference.place.lever2, covariance), constant.share * bias
     visible, believed = seen_and_believed(reference, found)
-    unobservable = largest_variance(reference, covariance), noise_share(reference, normal, variance)
-    amounts = torch.stack((visible, match, found.gain, believed, *unobservable, found.error, score), 1)
-    status, failed = decide(amounts, settings)  # strain is no lack of texture
-    if strained is not None:
-        covariance = torch.baddbmm(covariance, torch.bmm(axes, strained), axes.mT)
-    worst, rms = max(status.tolist()) if on_cpu else max(Status), (error / normal.total).sqrt()
-    tracked = reason = _zeros(len(pose), pose.device)  # Origin.TRACKED, Reason.NONE
-    if worst > Status.CONVERGED:
-        status, reason = explained(reference, found, failed, match, settings.min_score)
-    if worst > Status.MAX_ITERATIONS:
-        unfitted = ~normal.noise_share.isfinite()  # singular: all that is in sight of the patch is left
-        rms = torch.where(unfitted, (total[:, 2] / normal.total.clamp(min=LEAST)).sqrt(), rms)
+    amounts = visible, score, found.gain, believed, *unobservable, found.error
+    if strained is not None:  # which is no lack of texture
+        covariance = covariance + strained
+    covariance = torch.bmm(torch.bmm(axes, covariance), axes.mT)
+    tracked, status, reason = (codes.clone() for codes in _zeros(len(pose), pose.device))
+    rms = (error / normal.total).sqrt()
+    if not (is_cpu(pose.device) and beyond_doubt(amounts, settings)):
+        status, reason = verdict(reference, found, amounts, settings)
         good = Status.good(status)
+        unfitted = ~good & ~normal.noise_share.isfinite()  # singular: all that is in sight of the patch is left
+        rms = torch.where(unfitted, (total[:, 2] / normal.total.clamp(min=LEAST)).sqrt(), rms)
         pose = torch.where(good[:, None], pose, start)
         covariance = torch.where(good[:, None, None], covariance, unknown(covariance))
-    moved, last = pose - (start if origin is None else origin), (tracked.clone(), believed, reason.clone())
-    return Estimate(pose, moved, score, status, found.iterations, covariance, rms, *last)
+    moved = pose - (start if origin is None else origin)
+    return Estimate(pose, moved, score, status, found.iterations, covariance, rms, tracked, believed, reason)
 
 
-def decide(amounts: Tensor, settings: Settings) -> tuple[Tensor, Tensor]:
-    """Status codes (B,) int8 from the ``amounts`` (B, 8) that ``VERDICTS`` are about, the last of which is never
-    passed; and which test (B,) was the first to fail."""
-    sign, limit = _limits(settings, amounts.dtype, amounts.device)
-    first = (amounts * sign >= limit).to(torch.int8).argmin(1)  # NaN passes nothing
-    return _codes(0, amounts.device).index_select(0, first), first
+def beyond_doubt(amounts: Sequence[Tensor], settings: Settings) -> bool:
+    """Whether the host sees that all templates pass all tests."""
+    tests = zip(amounts, _limits(settings), strict=True)
+    return all(sign * value >= limit for amount, (sign, limit) in tests for value in amount.tolist())  # NaN never is
+
+
+def verdict(
+    reference: Reference, found: Solution, amounts: Sequence[Tensor], settings: Settings
+) -> tuple[Tensor, Tensor]:
+    """Status and reason codes (B,) int8 from the ``amounts``, (B,) each, that ``VERDICTS`` are about, of which the
+    second is the score: light that varies must not make a stranger of the template."""
+    visible, score, *others = amounts
+    match = torch.maximum(score, detrended(found.normal, found.total))
+    sign, limit = _limit_tensors(settings, match.dtype, match.device)
+    passed = (torch.stack((visible, match, *others), 1) * sign >= limit).to(torch.int8)  # NaN passes nothing
+    first = torch.nn.functional.pad(passed, (0, 1)).argmin(1)
+    return explained(reference, found, first, match, settings.min_score)
 
 
 def explained(
@@ -118,14 +164,18 @@ def without_contrast(reference: Reference, found: Solution) -> Tensor:
     return flat
 
 
-@constant
-def _limits(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Which way each amount counts, and how much it has to be at least, (8,) each."""
-    least = settings.min_visible, settings.min_score, torch.finfo(dtype).tiny, LEAST_COVERAGE
+def _limits(settings: Settings) -> list[tuple[int, float]]:
+    """Which way each amount counts, and how much it has to be at least."""
+    least = settings.min_visible, settings.min_score, torch.finfo(torch.float32).tiny, LEAST_COVERAGE
     most = LARGEST_SIGMA**2, 1.0, settings.tolerance
-    limit = torch.tensor([*least, *(-m for m in most), inf], dtype=dtype, device=device)
-    sign = torch.tensor([1, 1, 1, 1, -1, -1, -1, 1], dtype=dtype, device=device)
-    return sign, limit
+    return [*((1, value) for value in least), *((-1, -value) for value in most)]
+
+
+@constant
+def _limit_tensors(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The same, (7,) each."""
+    sign, limit = zip(*_limits(settings), strict=True)
+    return torch.tensor(sign, dtype=dtype, device=device), torch.tensor(limit, dtype=dtype, device=device)
 
 
 @constant
@@ -140,7 +190,7 @@ def seen_and_believed(reference: Reference, found: Solution) -> tuple[Tensor, Te
     normal, whole = found.normal, reference.normal
     if found.trust is None:
         all_of_it = torch.ones_like(found.error)
-        return all_of_it if normal is whole else normal.total / whole.total, all_of_it
+        return (all_of_it if normal is whole else normal.total / whole.total), all_of_it
     seen = found.sums[:, 0].sum(1, dtype=normal.total.dtype)
     visible, believed = seen / whole.total, normal.total / seen.clamp(min=LEAST)
     information = (normal.bread.diagonal(dim1=1, dim2=2) / whole.bread.diagonal(dim1=1, dim2=2)).amin(1)
@@ -182,69 +232,28 @@ def detrended(normal: Normal, total: Tensor) -> Tensor:
     return torch.where(solid, tg * (tt * gg).clamp(min=torch.finfo(tg.dtype).tiny).rsqrt(), 0.0).clamp(-1, 1)
 
 
-def interpolation_error(reference: Reference, axes: Tensor, interpolation: str) -> Tensor | None:
-    """What aliasing in the sampler shifts poses with ``axes`` (B, 3, 3), see ``pose.turn``, by: a square root (B, 3, 2)
-    of its covariance in the template's axes; None where it does not count.
-
-    Where all pixels lie alike between the frame's (no rotation) their errors add up; over a turned template they
-    cancel: the mean of exp(2 pi i k step) over n neighbours k is sin(pi n step) / (n sin(pi step)) but for its phase
-    (Dirichlet). The shift is ``Noise.alias`` times the sine of the phase, whose mean square is one half.
-    """
-    alias = reference.noise.alias.get(interpolation)
-    if alias is None:
-        return None
-    step = axes[:, 0, :2]
-    step = step - step.round()
-    coherent = torch.sinc(step * reference.grid.sides).div_(torch.sinc(step)).prod(1)
-    return alias * coherent[:, None, None]
-
-
-def pose_covariance(
-    reference: Reference,
-    normal: Normal,
-    variance: Tensor,
-    factor: Tensor,
-    axes: Tensor,
-    scatter: Tensor | None = None,
-    alias: Tensor | None = None,
-) -> Tensor:
-    """Covariance (B, 3, 3) of poses with ``axes`` (B, 3, 3), see ``pose.turn``, when template and frame have noise of
-    ``variance`` (B,): ``factor`` (B,) = 1 + 1 / gain^2 times the template's.
-
-    Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T, turned from the
-    template's axes to the frame's. The template's noise is taken out of S, and out of P for its own part P_t: a
-    derivative is antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 1 or 3): see
-    ``clinging``, by default white; ``alias`` (B, 3, 2): see ``interpolation_error``.
-    """
-    bias = torch.minimum(variance / reference.noise.frames, reference.noise.power)[:, None, None]
-    bread = torch.addcmul(normal.bread, bias, normal.bread_bias, value=-1)
-    meat = torch.addcmul(factor[:, None, None] * normal.meat, bias, normal.meat_bias, value=-1)
-    cofactors = torch.linalg.cross(bread.roll(-1, 1), bread.roll(-2, 1))  # the inverse is their transpose / det
-    determinant = (bread[:, :1] * cofactors[:, :1]).sum(2, keepdim=True)
-    scale = (variance.unsqueeze(1) if scatter is None else scatter).sqrt().unsqueeze(2)
-    bread = torch.bmm(axes, cofactors.mT * (scale / determinant))
-    covariance = torch.bmm(torch.bmm(bread, meat), bread.mT)
-    if reference.noise.place is not None:
-        covariance = covariance + axes @ reference.noise.place @ axes.mT
-    if alias is None:
-        return covariance
-    alias = torch.bmm(axes, alias)
-    return torch.baddbmm(covariance, alias, alias.mT)
-
-
-def largest_variance(reference: Reference, covariance: Tensor) -> Tensor:
-    """Variance (B,) of the farthest pixel's place, px^2."""
-    return (covariance.diagonal(dim1=1, dim2=2) * reference.place.lever2).sum(1)
-
-
 def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = None) -> Tensor:
     """The largest part (B,) of the information in any direction that the template's noise can be, whose variance is at
     most ``variance`` (B,), over what it may be: the more pixels there are, the better noise is told from texture.
     Infinite or NaN where the texture leaves a direction open."""
     power, frames = reference.noise.power, reference.noise.frames
-    most = max(NOISE_SHARE, 1 - CHANCE / reference.grid.pixels.shape[1] ** 0.5)
-    share = normal.noise_share * (power if variance is None else torch.minimum(power, variance / frames))
-    return share.div(most)
+    power = power if variance is None else torch.minimum(power, variance / frames)
+    return unit_share(reference.grid, normal) * power
+
+
+def unit_share(grid: Grid, normal: Normal) -> Tensor:
+    """The same (B,) for a noise of variance 1."""
+    return normal.noise_share.div(max(NOISE_SHARE, 1 - CHANCE / grid.pixels.shape[1] ** 0.5))
+
+
+def predicted_sigma(reference: Reference, normal: Normal, variance: Tensor) -> Tensor:
+    """Sigma (B, 3) px, px, rad of poses in frames with noise of ``variance`` (B,), of templates that are seen there as
+    they are; infinite where the pose is not observable."""
+    bias = torch.minimum(variance / reference.noise.frames, reference.noise.power)
+    covariance = pose_covariance(sandwich(reference.noise, normal), variance, torch.ones_like(variance), bias)
+    observable = largest_variance(reference.place.lever2, covariance) <= LARGEST_SIGMA**2
+    observable &= noise_share(reference, normal, variance) <= 1
+    return torch.where(observable[:, None], covariance.diagonal(dim1=1, dim2=2).sqrt(), torch.inf)
 
 
 def unknown(covariance: Tensor) -> Tensor:
@@ -258,6 +267,6 @@ def _infinite(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 @constant
-def _zeros(count: int, device: torch.device) -> Tensor:
-    """The codes (B,) of poses that no search has given, and that nothing speaks against."""
-    return torch.zeros(count, dtype=torch.int8, device=device)
+def _zeros(count: int, device: torch.device) -> list[Tensor]:
+    """Origin, status and reason codes (B,) of poses that no search has given, and that nothing speaks against."""
+    return [torch.zeros(count, dtype=torch.int8, device=device) for _ in range(3)]

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ecc.core.covariance import interpolation_error
 from torch_ecc.core.pose import rotation, turn
-from torch_ecc.core.verdict import interpolation_error
 from torch_ecc.paper.acquisition import tracker_of
 from torch_ecc.paper.errors import rms
 from torch_ecc.paper.steps import VIEW_UM, Staircase

@@ -26,7 +26,8 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import Sampler, downsample, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, picked
-from torch_ecc.core.solver import State, iterate
+from torch_ecc.core.solver import iterate
+from torch_ecc.core.step import State
 from torch_ecc.core.verdict import within_margin
 from torch_ecc.search.bank import Bank, search_level
 from torch_ecc.search.matched_filter import whitened_matches

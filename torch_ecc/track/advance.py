@@ -11,6 +11,7 @@ from torch_ecc.core.align import solve_again
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import Memory
+from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.track.budget import BURST
 
@@ -62,12 +63,13 @@ def remembering(state: State, image: Tensor, settings: Settings) -> Callable[[Re
 def advanced(state: State, estimate: Estimate) -> Estimate:
     """One frame on, in which nothing is suspect: the ``estimate``."""
     last, since, pose = state["pose"], state["since"], estimate.pose.detach()
-    step = (pose - last).div_(since.unsqueeze(1))
     state["score"].lerp_(estimate.score.detach(), MEMORY)
-    since.fill_(1)
+    step = torch.sub(pose, last, out=state["velocity"])
+    if not is_cpu(pose.device) or max(since.tolist()) > 1:
+        step.div_(since.unsqueeze(1))
+        since.fill_(1)
     state["found"].zero_()
     state["suspect_frames"].zero_()
-    state["velocity"].copy_(step)
     last.copy_(pose)
     return estimate
 

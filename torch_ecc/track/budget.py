@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from torch_ecc.core.sampling import is_cpu
+
 BURST = 3000.0  # frames of credit at most, and at first
 LEAST_FRAME = 400_000  # pixels' worth that every frame takes, however small it is: it has to come from somewhere
 SOLVE = 20  # times the pixels of a template: its solve
@@ -20,6 +22,11 @@ class Budget:
 
     def __init__(self, credit: Tensor, turn: Tensor, pixels: int, textured: int) -> None:
         self.credit, self.turn, self.frame = credit, turn, max(pixels + SOLVE * textured, LEAST_FRAME)
+
+    def earn(self, income: float) -> None:
+        """Another frame's, if there is not all the credit that there can be."""
+        if not is_cpu(self.credit.device) or float(self.credit) < BURST:
+            self.credit.add_(income)
 
     def left(self) -> bool:
         """Whether there is any credit, which is BURST at most."""

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.reference import Reference
-from torch_ecc.core.solver import State, iterate
+from torch_ecc.core.solver import iterate
+from torch_ecc.core.step import State
 from torch_ecc.search.locate import detrended_zncc_at
 
 COARSE_TOLERANCE = 0.1  # px of a coarse level

@@ -304,16 +304,17 @@ class Tracker(nn.Module):
         image = image if self.dead is None else self.dead.repair(image)
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image.detach()]
-        state["credit"].add_(self.income)
+        self._recovery.budget.earn(self.income)
         estimate = self._within_reach(self._solve(image, images, start))
-        doubtful, past = any(suspect(estimate, state["score"])), Past.of(state)
+        doubtful = any(suspect(estimate, state["score"]))
         if doubtful:
+            past = Past.of(state)
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
             estimate = self._within_reach(from_rest(reference, images[0], estimate, past, self.settings))
-        if doubtful and self.search:
-            estimate = self._within_reach(self._recovery(images, estimate, start, past))
-            suspects = suspect(estimate, state["score"])
-            estimate = disbelieved(estimate, suspects, start, past, self.references[0].place.radius)
+            if self.search:
+                estimate = self._within_reach(self._recovery(images, estimate, start, past))
+                suspects = suspect(estimate, state["score"])
+                estimate = disbelieved(estimate, suspects, start, past, reference.place.radius)
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
         if not doubtful and apart is estimate:
             return self._learned(image, advanced(state, estimate), [False] * len(start))

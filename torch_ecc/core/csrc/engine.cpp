@@ -56,7 +56,7 @@ bool answer(const Call& call, int64_t b) {
   State state{{at[0], at[1], at[2]}, {0, 0, 0, 0}};
   if (call.distortion) std::copy_n(call.distortion + 4 * which, 4, state.distortion);
   float* const sums = call.sums + b * SUMS * each;
-  double* const total = call.total + b * (SUMS + 3);
+  double* const total = call.total + b * (SUMS + CLUSTERS);
   const bool seen = solve(t, call.frame.after(which * call.next_frame), call.settings, state, scratch);
   if (seen) {
     if (scratch.partial) complete(t, t.whole, scratch.border);
@@ -65,7 +65,7 @@ bool answer(const Call& call, int64_t b) {
   } else {
     scratch.border.moments = {};
     std::fill_n(sums, SUMS * each, 0.f);
-    std::fill_n(total, SUMS + 3, 0.0);
+    std::fill_n(total, SUMS + CLUSTERS, 0.0);
   }
   std::copy_n(state.pose, 3, call.pose + 3 * b);
   call.error[b] = state.error;

@@ -1,4 +1,4 @@
-// The loop of torch_ecc/core/solver.py for one template: see there for the reasons behind each step and constant.
+// The loop of core/solver.py and core/step.py for one template: see there for the reasons behind each step and constant.
 #pragma once
 #include "border.h"
 #include "sums.h"
@@ -123,7 +123,7 @@ inline void fit(const Template& t, const Pixels& p, const Weighted& w, Model& m)
   m.fit = {0, 0, 0, gain, offset};
 }
 
-// solver.advance: accelerated step, update (eq. 10), predicted error.
+// step.advance: accelerated step, update (eq. 10), predicted error.
 inline void advance(double radius, const double (&step)[3], State& state) {
   const double delta[3] = {step[0], step[1], step[2] * radius}, last = state.length;
   double length = 0, along = 0;

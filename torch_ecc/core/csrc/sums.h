@@ -114,7 +114,18 @@ inline std::array<double, 2> rescaled(const Pixels& p, int k) {
 
 inline double finite(double value) { return std::isfinite(value) ? value : 0; }
 
-// sums (SUMS, blocks) of the last patch and its fit, as of solution.summed, and their total (SUMS + 3) over the blocks.
+// Square sum over lines of n values, from one to the next of which it is `step`, and `next` from line to line.
+inline double squares(const float* from, int64_t lines, int64_t next, int64_t n, int64_t step) {
+  double square = 0;
+  for (int64_t k = 0; k < lines; ++k) {
+    double sum = 0;
+    for (int64_t i = 0; i < n; ++i) sum += double(from[k * next + i * step]);
+    square += sum * sum;
+  }
+  return square;
+}
+
+// sums (SUMS, blocks) of the last patch and its fit, as of solution.summed, and their total (SUMS + CLUSTERS).
 // seen: the weights without trust.
 inline void summed(const Template& t, const Pixels& p, const Weights& seen, const Weighted& w, const float* patch,
                    Model& m, float* lines, float* sums, double* total) {
@@ -152,10 +163,12 @@ inline void summed(const Template& t, const Pixels& p, const Weights& seen, cons
   const double level = m.mean + m.base, power = added(2);
   if (!(power > ECC_FLAT * (power + level * level * w.total)))  // of a patch that is flat but for rounding g0 is 0
     std::fill_n(sums + count, 5 * count, 0.f);
-  for (int k = 0; k < SUMS; ++k) {
-    const float* const row = sums + k * count;
-    total[k] = finite(added(k));
-    if (k >= SUMS - 3) total[k + 3] = finite(std::inner_product(row, row + count, row, 0.0));
+  for (int k = 0; k < SUMS; ++k) total[k] = finite(added(k));
+  for (int k = 0; k < 3; ++k) {  // solution.clustered
+    const float* const effect = sums + (SUMS - 3 + k) * count;
+    total[SUMS + k] = finite(squares(effect, count, 1, 1, 1));
+    total[SUMS + 3 + k] = finite(squares(effect, count / across, across, across, 1));
+    total[SUMS + 6 + k] = finite(squares(effect, across, 1, count / across, across));
   }
 }
 

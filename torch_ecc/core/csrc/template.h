@@ -12,7 +12,7 @@
 namespace ecc {
 
 constexpr int MOST = ECC_MOST, SSD = -1, PAPER = -2;  // columns; criteria in place of a number of light columns
-constexpr int64_t BLOCK = ECC_BLOCK, SUMS = ECC_SUMS;  // px; rows of solution.summed
+constexpr int64_t BLOCK = ECC_BLOCK, SUMS = ECC_SUMS, CLUSTERS = ECC_CLUSTERS;  // px; see core/solution.py
 inline int64_t blocks(int64_t n) { return (n + BLOCK - 1) / BLOCK; }  // along n px
 using Coefficients = std::array<double, MOST>;        // of [G, t less its mean, 1, t u, t v, t u^2, t v^2, t u v]
 using Matrix = double[MOST][MOST];

@@ -1,0 +1,96 @@
+"""The covariance of poses: what the noise of template and frame, and aliasing in the sampler, make of them.
+
+All of it is in the template's axes; ``pose.turn`` takes it to the frame's.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.noise import Noise
+from torch_ecc.core.normal import Normal
+from torch_ecc.core.reference import Reference
+
+
+class Sandwich(NamedTuple):
+    """What of the covariance of B templates is the same in every frame. ``bread`` (B, 6, 3): rows 1, 2 and 0 of
+    Z W G^T off the other columns, and then 2, 0 and 1, whose cross products are its cofactors; ``meat`` = Z W (Z W)^T
+    off these, (B, 3, 3), and ``placed``, what of it the template's place is uncertain by; what white noise of unit
+    variance in the template adds to them, ``bread_bias`` and ``meat_bias``; ``place`` (B, 3, 3), see ``Noise``, and
+    ``alias`` (B, 3, 3), what aliasing adds to that if it all adds up."""
+
+    bread: Tensor
+    bread_bias: Tensor
+    meat: Tensor
+    meat_bias: Tensor
+    placed: Tensor
+    place: Tensor
+    alias: Tensor
+
+
+def sandwich(noise: Noise, normal: Normal, interpolation: str = "") -> Sandwich:
+    """Of templates with this ``noise`` and these ``normal`` equations, looked at by a sampler."""
+    bread, bias = (
+        torch.cat((each.roll(-1, 1), each.roll(-2, 1)), 1).contiguous() for each in (normal.bread, normal.bread_bias)
+    )
+    alias, none = noise.alias.get(interpolation), torch.zeros_like(normal.meat)
+    placed = noise.place_share[:, None, None] * normal.meat
+    known = none if noise.place is None else noise.place, none if alias is None else alias @ alias.mT
+    return Sandwich(bread, bias, normal.meat, normal.meat_bias, placed, *known)
+
+
+def pose_covariance(
+    known: Sandwich,
+    variance: Tensor,
+    power: Tensor,
+    bias: Tensor,
+    scatter: Tensor | None = None,
+    coherent: Tensor | None = None,
+) -> Tensor:
+    """Covariance (B, 3, 3) of poses when one frame's noise has a ``variance`` (B,) and the frame's part of it is seen
+    with a gain of the square ``power`` (B,).
+
+    Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T. The template's
+    noise, of variance ``bias`` (B,), is taken out of S, and out of P for its own part P_t: a derivative is
+    antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 1, 3): how many times what
+    white noise would do each row of K feels, see ``clinging``; ``coherent`` (B, 1, 1): see ``coherence``.
+    """
+    variance, power, bias = (value.view(-1, 1, 1) for value in (variance, power, bias))
+    first, second = torch.addcmul(known.bread, bias, known.bread_bias, value=-1).split(3, 1)
+    cofactors = torch.linalg.cross(first, second)  # the inverse is their transpose / det
+    determinant = torch.bmm(first, cofactors.mT)[:, 1:2, 2:]
+    meat = torch.addcmul(known.meat, power, known.placed)  # all times gain^2
+    meat = torch.addcmul(meat, power * bias, known.meat_bias, value=-1)
+    white = variance / power
+    root = (white if scatter is None else scatter * white).sqrt() / determinant
+    half = cofactors * root
+    rest = known.place if coherent is None else torch.addcmul(known.place, known.alias, coherent.square())
+    return torch.baddbmm(rest, torch.bmm(half.mT, meat), half)
+
+
+def coherence(axes: Tensor, sides: Tensor) -> Tensor:
+    """How much of aliasing in the sampler adds up over templates of ``sides`` (2,) px at poses with ``axes``
+    (B, 3, 3), see ``pose.turn``: (B, 1, 1).
+
+    Where all pixels lie alike between the frame's (no rotation) their errors add up; over a turned template they
+    cancel: the mean of exp(2 pi i k step) over n neighbours k is sin(pi n step) / (n sin(pi step)) but for its phase
+    (Dirichlet).
+    """
+    step = axes[:, :1, :2]
+    step = step - step.round()
+    return torch.sinc(step * sides).div(torch.sinc(step)).prod(2, keepdim=True)
+
+
+def interpolation_error(reference: Reference, axes: Tensor, interpolation: str) -> Tensor | None:
+    """What aliasing shifts poses with ``axes`` (B, 3, 3) by: a square root (B, 3, 2) of its covariance; None where it
+    does not count. The shift is ``Noise.alias`` times the sine of the phase, whose mean square is one half."""
+    alias = reference.noise.alias.get(interpolation)
+    return None if alias is None else alias * coherence(axes, reference.grid.sides)
+
+
+def largest_variance(lever2: Tensor, covariance: Tensor) -> Tensor:
+    """Variance (B,) of the place of a pixel with squared ``lever2`` (B, 3), px^2, under a ``covariance`` (B, 3, 3)."""
+    return (covariance.diagonal(dim1=1, dim2=2) * lever2).sum(1)
