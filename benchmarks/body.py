@@ -23,13 +23,13 @@ from results import save, show
 from rigid import SCENE, Drawn, Near, Plan, draw
 from rivals import rivals
 from scaling import slope
-from staircase import climbed
 from torch import Tensor
 
 import torch_ecc as te
 from torch_ecc.core.pose import compose, inverse, transform
+from torch_ecc.paper.body import run as experiment
 from torch_ecc.paper.bound import cramer_rao, rounding
-from torch_ecc.paper.errors import box, largest, rms
+from torch_ecc.paper.errors import rms
 from torch_ecc.paper.result import Number
 from torch_ecc.sim import Camera, harmonic, placed
 
@@ -44,9 +44,10 @@ def scatters(draws: int) -> list[Number]:
         (Plan(), 2.0, draws),
         (Plan(), 5.0, draws),
         (Plan(2048, 8, 61, 1700), 2.0, max(draws // 5, 10)),
+        (Plan(2048, 8, 81, 1700), 2.0, max(draws // 5, 10)),
     ):
         found, bound = draw(plan, noise, count), plan.bound(noise)
-        words = f"{plan.side}^2, {plan.across**2} patches, noise {noise:g}"
+        words = f"{plan.side}^2, {plan.across**2} patches of {plan.size} px, noise {noise:g}"
         one = float(cramer_rao(SCENE, (121, 121), 2 * (noise**2 + rounding(8)))[2])
         theta, ratio = 1e6 * float(rms(found.error)[2]), rms(found.error) / bound
         told = (f"{theta:.2f}", f"{1e6 * float(bound[2]):.2f}", f"{1e6 * one:.1f}", f"{1e6 * one / theta:.1f}")
@@ -196,30 +197,12 @@ def _timed(call: Callable[[Tensor], object], frame: Tensor) -> float:
     return time.perf_counter() - begun
 
 
-def steps(dwell_s: float) -> list[Number]:
+def steps(quick: bool) -> list[Number]:
     """Figs. 10 and 11: the boxes of a dwell, and the means of dwells minus those of the capacitive sensors."""
-    rows, figures = [], []
-    found = climbed(dwell_s, lambda done, total: None)
-    for name in ("ECC", "body", "CDS"):
-        dwells = found.dwells[name]
-        within = [dwells.errors[dwells.step == k, 2].rad2deg() for k in range(len(dwells.mean))]
-        end, everything = float(torch.stack([box(w) for w in within]).max()), torch.cat(within)
-        cells = [f"{v:.6f}" for v in (end, float(rms(everything)), float(largest(everything)))]
-        off = (found.mean_deg(name) - found.mean_deg("CDS"))[1:]
-        true = _against_truth(found, name)
-        rows.append((name, *cells, f"{float(largest(off)):.6f}", f"{float(largest(true)):.6f}"))
-        figures.append(Number(f"fig10 {name} / end of the largest box", end, "deg", "lower", 0.2))
-        figures.append(Number(f"fig11 {name} / largest absolute error", float(largest(off)), "deg", "lower", 0.2))
-    header = ("", "largest box, deg", "rms", "largest", "Fig. 11: minus CDS", "minus the truth")
-    show(f"Figs. 10 and 11, dwells of {dwell_s:g} s", header, rows)
-    return figures
-
-
-def _against_truth(found, name: str) -> Tensor:
-    """Means (K,) of the steps of theta minus those of what the image really did, deg; NaN for the sensors."""
-    if name == "CDS":
-        return torch.full((len(found.dwells["CDS"].mean) - 1,), math.nan)
-    return (found.mean_deg(name) - found.mean_deg("truth"))[1:]
+    found = experiment(quick, lambda done, total: None)
+    for table in found.tables:
+        show(table.title, table.header, table.rows)
+    return [number._replace(tolerance=0.2) for number in found.records]
 
 
 def clockwork(folder: Path) -> list[Number]:
@@ -278,7 +261,7 @@ def main(draws: int, only: tuple[str, ...], quick: bool, data: Path | None, out:
         "apart": lambda: apart(draws),
         "lenses": lambda: lenses(6 if quick else 16),
         "speed": lambda: speed(8 if quick else 40),
-        "steps": lambda: steps(0.3 if quick else 1.0),
+        "steps": lambda: steps(quick),
     }
     if data is not None:
         sections["clockwork"] = lambda: clockwork(data / "mechanism_video")

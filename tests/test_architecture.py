@@ -19,7 +19,7 @@ FLOORS = [{"core"}, {"search"}, {"track"}, {"servo", "body"}, {"commands"}, {"pa
 # Leaves import nothing of the package but pose; what may use them, beside the floors above ``track``.
 LEAVES = {"io", "plots", "records", "config", "sim"}
 LEAF_USERS = {"commands", "paper", "view", "cli"}
-LEAVES_BELOW = {("servo", "records"), ("body", "records"), ("sim", "config")}
+LEAVES_BELOW = {("servo", "records"), ("body", "records"), ("sim", "config"), ("sim", "records")}
 ROOMS = {"sim": ["scene", "camera", "stage"]}  # the floors of a leaf, from the bottom up
 
 

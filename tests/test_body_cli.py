@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from torch_ecc.cli import app
 from torch_ecc.commands.track import Session, TrackJob
-from torch_ecc.sim import Camera, PlaneWaves, harmonic, placed
+from torch_ecc.sim import Camera, PlaneWaves, from_config, harmonic, placed
 
 PATH = placed(harmonic((5.0, 3.0, 0.02), 12), (160.0, 120.0))
 
@@ -77,6 +77,27 @@ def test_two_bodies_and_what_one_does_as_seen_from_the_other(video, tmp_path):
         assert float(row["sigma_relative_theta_rad"]) > float(row["sigma_theta_rad"])
 
 
+def test_a_lens_is_told_to_the_simulator_and_to_the_track(tmp_path):
+    """What the one bends the other straightens, from numbers and from a file; without it the body is far off."""
+    config = {
+        "scene": {"kind": "waves", "count": 40},
+        "motion": {"kind": "ramp", "points": 3, "end": [60.0, 0.0, 0.0], "lead_in": 0},
+        "camera": {"size": [200, 280], "noise_sigma": 1.0, "lens": {"k1": 0.03}},
+        "template": {"size": [41, 41]},
+    }
+    sequence = from_config(config).sequence
+    np.save(tmp_path / "v.npy", sequence.batch(0, 3)[:, 0].numpy())
+    (tmp_path / "lens.toml").write_text("center = [139.5, 99.5]\nfocal = 171.337\nk1 = 0.03\n")
+    errors = []
+    for k, lens in enumerate((None, "0.03", str(tmp_path / "lens.toml"))):
+        job = TrackJob(input=str(tmp_path / "v.npy"), grid=4, size=41, body=True, out=str(tmp_path / str(k)), lens=lens)
+        rows, _ = read(Session(job).run().folder)
+        errors.append((float(rows[-1]["dx_px"]) - 60) / float(rows[-1]["sigma_x_px"]))
+    assert abs(errors[0]) > 5
+    assert max(map(abs, errors[1:])) < 4
+    assert errors[1] == pytest.approx(errors[2], abs=0.1)
+
+
 def test_it_goes_on_where_it_was_stopped(video, tmp_path):
     """With body and overlay, as if nothing had happened."""
     whole, parts = (
@@ -99,12 +120,17 @@ def test_it_goes_on_where_it_was_stopped(video, tmp_path):
     ("changes", "message"),
     [
         ({"body": True, "bodies": 2}, "body: not with bodies"),
+        ({"lens": "0.1"}, "lens: expected with body or bodies, whose poses it straightens; got '0.1' alone"),
+        ({"lens": "0.1,wide", "body": True}, "lens: expected a file.toml or k1,k2,p1,p2, got '0.1,wide'"),
+        ({"lens": "1,2,3,4,5", "body": True}, "lens: expected at most k1,k2,p1,p2, got '1,2,3,4,5'"),
+        ({"lens": "none.toml", "body": True}, "config: no such file: none.toml"),
+        ({"lens": "-0.6", "body": True}, "the lens is one to one up to"),
         ({"bodies": 0}, "bodies: expected at least 1, got 0"),
         ({"bodies": 2, "grid": None, "centers": ((160.0, 120.0),)}, "bodies: expected two templates or more, got 1"),
     ],
 )
 def test_wrong_calls(video, tmp_path, changes, message):
     settings = {"input": str(video / "one.npy"), "grid": 3, "size": 41, "out": str(tmp_path / "x")}
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
         Session(TrackJob(**(settings | changes)))
     assert not (tmp_path / "x").exists()

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torch_ecc.paper import circles, fig6, fig7, fig8, fig9, fig10, fig11, parasitic, steps
+from torch_ecc.paper import body, circles, fig6, fig7, fig8, fig9, fig10, fig11, parasitic, steps
 from torch_ecc.paper.acquisition import Bench, ease, zeroed
 from torch_ecc.records.motion import Motion
 from torch_ecc.sim.scene.micrograph import micrograph
@@ -38,6 +38,31 @@ def test_every_limit_is_kept(outcomes, name):
     for table in outcome.tables:
         assert {len(row) for row in table.rows} == {len(table.header)}
         assert "nan" not in " ".join(cell for row in table.rows for cell in row)
+
+
+def test_a_body_beside_the_template(outcomes, monkeypatch):
+    """The three figures of it; what the template itself has found instead of a body is as good as the template."""
+    found = steps.staircase(True, lambda done, total: None)
+    twice = [values | {"body": values["ECC"]} for values in (found.tracks, found.dwells)]
+    twin = body.with_truth(found._replace(tracks=twice[0], dwells=twice[1]))
+    monkeypatch.setattr(body, "staircase", lambda quick, advance: twin)
+    outcome = body.run(True, lambda done, total: None)
+    assert [picture.name for picture in outcome.pictures] == ["fig8_body", "fig10_body", "fig11_body"]
+    shares = [record.value for record in outcome.records if "over the template" in record.name]
+    assert shares == [1.0] * 5
+    noise, all_of_it = (body.figures(twin, "ECC")[name] for name in ("rms, less the truth", "Fig. 10: rms"))
+    assert noise < 1.05 * all_of_it
+
+
+def test_a_body_tells_where_the_template_is():
+    """The same point as the template's, and nearer to the truth."""
+    path = torch.zeros(600, 3, dtype=torch.float64)
+    path[:, 2] = 1e-3 * ease(torch.linspace(-1, 1.5, 600))
+    got = body.BodyBench(Microscope(region_px=(170, 250), exposure_s=0.0)).acquire(path, lambda: None)
+    errors = {name: (track.pose - got.truth.pose).square().mean(0).sqrt() for name, track in got.tracks.items()}
+    assert errors["body"][2] < 0.8 * errors["ECC"][2]
+    assert (errors["body"][:2] < 0.02).all()  # um
+    assert len(body.fields(170, 250)) == 6
 
 
 def test_the_joint_estimate_keeps_what_the_nearest_points_absorb(outcomes):

@@ -193,6 +193,15 @@ def commented_tables() -> list[str]:
     return ["\n".join(table) for table in tables]
 
 
+def test_a_template_is_marked_where_the_lens_shows_it():
+    """At a pixel of the frame; its truth is that of the point which the lens shows there."""
+    simulation = from_config({"camera": {"lens": {"k1": 0.05}}, "template": {"center": [200, 180]}})
+    center, lens = torch.tensor([200.0, 180.0], dtype=torch.float64), simulation.sequence.camera.lens
+    torch.testing.assert_close(simulation.truth[0, 0, :2], lens.undistort(center))
+    assert float((simulation.truth[0, 0, :2] - center).norm()) > 0.5
+    assert (lens.center, lens.focal) == ((319.5, 239.5), math.hypot(319.5, 239.5))
+
+
 @pytest.mark.parametrize("text", commented_tables(), ids=lambda t: " ".join(t.split("#")[0].split()))
 def test_every_alternative_of_the_shipped_configuration_works(text, tmp_path):
     cv2.imwrite(str(tmp_path / "still.png"), np.random.default_rng(0).integers(0, 256, (60, 70), dtype=np.uint8))
@@ -252,6 +261,8 @@ def test_settings_reach_the_camera():
         ({"camera": {"noise": 1}}, r"\[camera\]: unknown key 'noise' \(did you mean 'noise_sigma'\?\)"),
         ({"camera": {"light": {}}}, r"\[camera\]: unknown key 'light' \(known keys: size, "),
         ({"camera": {"drift": {"gian": 1}}}, r"\[camera\]: drift: unknown key 'gian' \(did you mean 'gain'\?\)"),
+        ({"camera": {"lens": {"k3": 1}}}, r"\[camera.lens\]: unknown key 'k3'"),
+        ({"camera": {"lens": {"k1": -0.6}}}, r"\[camera.lens\]: the lens is one to one up to 1\d\d px"),
         ({"camera": {"occluders": [{"center": [1, 2]}]}}, r"\[camera\]: occluders\[0\]: missing key 'half_size'"),
         ({"camera": {"drift": {"x": 1}}}, r"drift: unknown key 'x' \(known keys: gain, offset, period\)"),
         ({"camera": {"drift": {"period": 0}}}, r"\[camera\]: drift: Drift: period must be"),

@@ -111,7 +111,7 @@ class Body(nn.Module):
         groups = [range(len(start))] if groups is None else groups
         _check_groups(groups, len(start))
         _warn_of_overlap(groups, start, [n - 2 * MARGIN for n in tracker.template.shape[2:]])
-        self.tracker, self.layout = tracker, layout_of(tracker, groups, lens)
+        self.tracker, self.lens, self.layout = tracker, lens, layout_of(tracker, groups, lens)
         self.register_buffer("before", self.layout.start.clone())  # the last good poses, (G, 3)
         self.register_buffer("found", self.layout.start.new_ones(len(groups), dtype=torch.int8))  # in the last frame
         self.register_buffer("apart", start.new_zeros(len(start), dtype=torch.int64))  # frames in a row, of patches

@@ -40,7 +40,8 @@ from torch_ecc.commands.batch_unit import (
     told,
 )
 from torch_ecc.commands.jobs import span
-from torch_ecc.commands.track import Session, given_settings, restore, state_of
+from torch_ecc.commands.run import restore, state_of
+from torch_ecc.commands.track import Session, given_settings
 from torch_ecc.core.estimate import Status
 from torch_ecc.io import open_frames
 from torch_ecc.io.journal import Journal, Unfinished, rows_file

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,12 @@ from torch import Tensor
 from torch_ecc.body.body import Body, BodyEstimate
 from torch_ecc.body.centre import rotation_centre
 from torch_ecc.body.grouping import rigid_groups
+from torch_ecc.commands.jobs import TrackJob
+from torch_ecc.config import fill, read_toml
 from torch_ecc.core.estimate import Estimate, Status, Track
 from torch_ecc.io.output import append, create, part, publish
 from torch_ecc.io.summary import write_json
+from torch_ecc.records.lens import Lens
 from torch_ecc.track.tracker import Tracker
 
 BODY_FILES = ("body.csv", "body.json", "body.png")
@@ -26,20 +30,44 @@ POSE = ("x_px", "y_px", "theta_rad")
 SELDOM = 0.5  # of the frames in which it was found: a patch that agrees in fewer is named
 
 
-def drawn_with(body: BodyEstimate, estimate: Estimate) -> Estimate:
+def read_lens(job: TrackJob, frame: Tensor) -> Lens | None:
+    """The lens before each ``frame`` (..., h, w), None if ``job`` tells of none: a TOML file of what ``Lens`` takes, or
+    k1,k2,p1,p2 about the middle of the frame in units of half its diagonal. ValueError for what is neither."""
+    if job.lens is None:
+        return None
+    if not (job.body or job.bodies is not None):
+        raise ValueError(f"lens: expected with body or bodies, whose poses it straightens; got {job.lens!r} alone")
+    numbers = job.lens.split(",")
+    try:
+        terms = [float(number) for number in numbers]
+    except ValueError:
+        if len(numbers) > 1 or Path(job.lens).suffix != ".toml":
+            raise ValueError(f"lens: expected a file.toml or k1,k2,p1,p2, got {job.lens!r}") from None
+        return fill(Lens, read_toml(job.lens), job.lens)
+    if len(terms) > 4:
+        raise ValueError(f"lens: expected at most k1,k2,p1,p2, got {job.lens!r}")
+    middle = (frame.shape[-1] - 1) / 2, (frame.shape[-2] - 1) / 2
+    return Lens(middle, math.hypot(*middle), *terms)
+
+
+def drawn_with(body: BodyEstimate, estimate: Estimate, lens: Lens | None = None) -> Estimate:
     """The ``estimate`` as the overlay draws it: patches that do not agree as doubtful, and their body one template
-    more, whose score is the share that agrees."""
+    more, where a ``lens`` shows it, whose score is the share that agrees."""
     apart = ~body.used & (estimate.status == Status.CONVERGED)
     status = torch.where(apart, int(Status.MAX_ITERATIONS), estimate.status).to(torch.int8)
     one = estimate.at(torch.zeros_like(body.status, dtype=torch.int64))
-    one = one._replace(pose=body.pose, displacement=body.displacement, covariance=body.covariance, status=body.status)
+    pose = body.pose if lens is None else lens.distort_pose(body.pose)
+    one = one._replace(pose=pose, displacement=body.displacement, covariance=body.covariance, status=body.status)
     one = one._replace(score=body.used.to(one.score.dtype).mean()[None])
     both = zip(estimate._replace(status=status), one, strict=True)
     return Estimate(*(torch.cat((a, b)) for a, b in both))
 
 
-def write_bodies(folder: Path, tracker: Tracker, bodies: int | None, um_matrix: Tensor | None, first: Tensor) -> None:
-    """The bodies of the track.npz in ``folder``: one of all its templates, or so many ``bodies`` by their motion."""
+def write_bodies(
+    folder: Path, bodies: int | None, tracker: Tracker, lens: Lens | None, um_matrix: Tensor | None, first: Tensor
+) -> None:
+    """The bodies of the track.npz in ``folder``: one of all its templates, or so many ``bodies`` by their motion; as
+    without the ``lens``."""
     from torch_ecc.plots.body import plot_body
 
     with np.load(folder / "track.npz") as found:
@@ -51,7 +79,7 @@ def write_bodies(folder: Path, tracker: Tracker, bodies: int | None, um_matrix: 
     groups, still = [list(range(track.pose.shape[1]))], False
     if bodies is not None:
         groups, still, _ = rigid_groups(track, bodies)
-    found_bodies = Body(tracker, groups)(track)
+    found_bodies = Body(tracker, groups, lens)(track)
     rows = _rows(found_bodies, groups, (number, time), um_matrix)
     file = create(part(folder, "body.csv"))
     try:

@@ -81,6 +81,11 @@ class TrackJob(Tracking):
     bodies: int | None = described(
         None, "so many rigid bodies that move, told apart by their motion, beside what stands still", example=2
     )
+    lens: str | None = described(
+        None,
+        "of a body: k1,k2,p1,p2 about the frame's middle, of half its diagonal, or a file.toml of te.Lens",
+        example="-0.003,0.0005",
+    )
     reference: str | None = described(
         None, "image to cut the templates from; without it, the first frame of the input", example="first.png"
     )

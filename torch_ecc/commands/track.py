@@ -6,9 +6,9 @@ import dataclasses
 import errno
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_ecc.body.body import Body
-from torch_ecc.commands.bodies import BODY_FILES, drawn_with, told, write_bodies
+from torch_ecc.commands.bodies import BODY_FILES, read_lens, told, write_bodies
 from torch_ecc.commands.jobs import TrackJob, span
 from torch_ecc.commands.live import Latency, Send, sender
+from torch_ecc.commands.run import Pictures, Run
 from torch_ecc.commands.templates import Templates, choose_templates, read_frame_mask, read_templates, refuse_doubt
 from torch_ecc.core.ambient import threads_for
 from torch_ecc.core.estimate import Estimate, Reason, Status
@@ -30,16 +31,12 @@ from torch_ecc.io.stabilised import StabilisedWriter
 from torch_ecc.io.stacks import Stack
 from torch_ecc.io.summary import plain
 from torch_ecc.io.track import FILES
-from torch_ecc.track.lessons import LESSONS
 from torch_ecc.track.tracker import Tracker
-
-Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 
 STATUS_NAMES = {int(code): code.name for code in Status}
 REASON_NAMES = {int(code): code.word for code in Reason}
 RESULTS = (*FILES, *BODY_FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
 NOT_OF_THE_RESULT = ("out", "force", "resume", "send")
-CONSTANT = ("template", "mask", "centre", "first", *LESSONS)  # of a tracker's state, or too large for a journal
 
 
 class Finished(NamedTuple):
@@ -97,7 +94,7 @@ class Session:
             (h, w), (h0, w0) = self.source.shape, first.shape[-2:]
             raise ValueError(f"reference: expected an image of the input's size {w}x{h} px, got {w0}x{h0} px")
         self.templates = choose_templates(job, first) if crops is None else Templates.of(crops)
-        self.calibration = job.calibration(self.source.um_per_px)
+        self.calibration, self.lens = job.calibration(self.source.um_per_px), read_lens(job, first)
         self.send: Send = sender(job.send, self._um_matrix()) if job.send is not None else lambda frame, estimate: None
         if self.source.live and job.resume:
             raise ValueError("resume: a camera does not go back to where it was")
@@ -112,7 +109,7 @@ class Session:
                 near = torch.tensor(job.centers).double() if job.centers else None
                 self.tracker, located = Tracker.find(crops, first, near=near, **options)
                 refuse_doubt(located, near is not None)
-        self.body = Body(self.tracker) if job.body else None
+        self.body = Body(self.tracker, lens=self.lens) if job.body else None
         if job.bodies is not None and len(centers) < 2:
             raise ValueError(f"bodies: expected two templates or more, got {len(centers)}")
         self.settings, self.first = settings_of(job, first), first
@@ -146,9 +143,7 @@ class Session:
         with claim(self.folder):
             films = [film for film in (self._overlay(), self._stabilised()) if film is not None]
             left = self._left(films)
-            run = _Run(self, self._track_writer(left), films)
-            if left is not None:
-                run.go_on(left, self.folder)
+            run = self._run(left, films)
             stopped: BaseException | None = None
             try:
                 with run, suppress(*([KeyboardInterrupt] if self.source.live else [])):  # how else would a camera end
@@ -170,21 +165,28 @@ class Session:
         leave them there as a run that was ended before its time: without results, to go on with."""
         with claim(self.folder):
             left = self._left([])
-            run = _Run(self, self._track_writer(left), [])
+            run = self._run(left, [])
             if left is not None:
-                run.go_on(left, self.folder)
                 first = _last(left, self.folder) + 1
             try:
                 run.through(ahead(self.source.between(first, last)), progress)
             finally:
                 run.track.leave()
 
+    def _run(self, left: Unfinished | None, films: list[Pictures]) -> Run:
+        """One that goes on where what is ``left`` ends."""
+        run = Run(self.tracker, self.body, self._track_writer(left), films, self.job.stop_at_damage)
+        if left is not None:
+            run.go_on(left, self.folder)
+        return run
+
     def _write_bodies(self) -> None:
         """body.csv, body.json and body.png, if there are bodies."""
         for name in BODY_FILES:
             (self.folder / name).unlink(missing_ok=True)
         if self.job.body or self.job.bodies is not None:
-            write_bodies(self.folder, self.tracker, self.job.bodies, self._um_matrix(), self.first)
+            seen = self.tracker, self.lens, self._um_matrix(), self.first
+            write_bodies(self.folder, self.job.bodies, *seen)
 
     def _remove_old(self, films: set[str]) -> None:
         """What a result before had and this one does not."""
@@ -256,105 +258,6 @@ class Session:
         from torch_ecc.plots import plot_track  # slow to import
 
         plot_track(self.folder / "track.npz", self.folder / "track.png", title=self.source.name)
-
-
-class _Run:
-    """The files and the counts of a run, as ``Finished`` has them."""
-
-    def __init__(self, session: Session, track: TrackWriter, films: list[Pictures]) -> None:
-        self.tracker, self.track, self.films, self.body = session.tracker, track, films, session.body
-        self.stop_at_damage, tracker = session.job.stop_at_damage, session.tracker
-        self.latency = Latency()
-        self.done, self.damaged, self.reasons = 0, 0, np.zeros(len(Reason), np.int64)
-        self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
-        # What the next frame depends on: all of it goes into the journal with every frame.
-        self._state = state_of(tracker)
-        self._state += [] if self.body is None else list(self.body.buffers(recurse=False))
-        self._views = [part.numpy() for part in self._state if part.device.type == "cpu"]  # they see what is written
-        for film in films:
-            film.film.resumable = True
-        self._open = ExitStack()
-
-    def __enter__(self) -> Self:
-        for writer in (self.track, *self.films):
-            self._open.enter_context(writer)
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._open.__exit__(*error)
-
-    def through(
-        self, frames: Iterable[Frame], progress: Callable[[int], None], *told: Callable[[Frame, Estimate], None]
-    ) -> None:
-        """All of them; ``progress`` is told how many frames are done, before that each of ``told`` what was found."""
-        for raw in frames:
-            frame, estimate = self.look(raw)
-            for tell in told:
-                tell(frame, estimate)
-            self.write(frame, estimate)
-            progress(self.done)
-
-    def look(self, frame: Frame) -> tuple[Frame, Estimate]:
-        """What is found in one frame more, which may turn out to be damaged. ValueError if that is to be the end."""
-        try:
-            if frame.pixels is None:
-                raise ValueError(frame.damage)
-            estimate: Estimate = self.tracker(frame.pixels)
-        except ValueError as error:
-            if self.stop_at_damage:
-                raise ValueError(f"frame {frame.number}: {error}") from error
-            return dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
-        self.latency.add(frame)
-        return frame, estimate
-
-    def write(self, frame: Frame, estimate: Estimate) -> None:
-        """Append what was found in a frame to all files."""
-        shown = estimate if self.body is None else drawn_with(self.body(estimate), estimate)
-        views = self._views or [part.cpu().numpy() for part in self._state]
-        self.track.write(estimate, frame, b"".join(view.tobytes() for view in views))
-        for film in self.films:
-            film.write(frame, shown if isinstance(film, OverlayWriter) else estimate)
-        self._count(*(code.cpu().numpy()[None] for code in (estimate.status, estimate.reason)))
-
-    @property
-    def counts(self) -> tuple[int, int, NDArray[np.int64], NDArray[np.int8], NDArray[np.int64]]:
-        """The first fields of ``Finished``."""
-        return self.done, self.damaged, self.lost, self.last, self.reasons
-
-    def _count(self, status: NDArray[np.int8], reason: NDArray[np.int8]) -> None:
-        """Frames more with ``status`` and ``reason`` (F, R)."""
-        self.done, self.last = self.done + len(status), reason[-1]
-        self.reasons += np.bincount(reason.ravel(), minlength=len(Reason))
-        if status.max() > Status.MAX_ITERATIONS:
-            damaged = status == Status.DAMAGED
-            self.damaged += int(damaged[:, 0].sum())
-            self.lost += ((status > Status.MAX_ITERATIONS) & ~damaged).sum(0)
-
-    def go_on(self, left: Unfinished, folder: Path) -> None:
-        """After the frames that an unfinished run has left in ``folder``."""
-        records = left.records(folder)
-        restore(self._state, records["state"][-1].tobytes())
-        for film in self.films:
-            pose, found = np.array(records["pose"]), records["status"] <= Status.MAX_ITERATIONS
-            if self.body is not None and isinstance(film, OverlayWriter):  # the body, too, whose trail begins anew
-                pose, found = np.pad(pose, ((0, 0), (0, 1), (0, 0))), np.pad(found, ((0, 0), (0, 1)))
-            film.go_on(pose, found)
-        for block in left.blocks(folder):
-            self._count(block["status"], block["reason"])
-
-
-def state_of(tracker: Tracker) -> list[Tensor]:
-    """The parts of a tracker that change from frame to frame, in the order in which a journal has them."""
-    return [part for name, part in tracker.named_buffers() if name not in CONSTANT]
-
-
-def restore(parts: list[Tensor], state: bytes) -> None:
-    """Write a journal's ``state`` into the parts that it is of."""
-    for part in parts:
-        size = part.numel() * part.element_size()
-        value = np.frombuffer(state[:size], part.cpu().numpy().dtype).reshape(tuple(part.shape))
-        part.copy_(torch.from_numpy(value.copy()))
-        state = state[size:]
 
 
 def _last(left: Unfinished, folder: Path) -> int:

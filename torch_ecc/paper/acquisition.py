@@ -21,6 +21,7 @@ from torch_ecc.records.calibration import Calibration
 from torch_ecc.records.motion import Motion
 from torch_ecc.sim import Floor, Microscope, Sensors, Sequence, Stage, StageMotion, StageSettings, micrograph
 from torch_ecc.sim.camera.light import Light
+from torch_ecc.sim.scene.scene import Scene
 from torch_ecc.sim.scene.window import Window
 from torch_ecc.track.tracker import Tracker
 
@@ -93,15 +94,23 @@ class Bench:
         spread = (self.microscope.camera().blur_sigma ** 2 + 1 / 12) ** 0.5
         settings = {"light": self.light, "gain": self.gain, "noise_sigma": NOISE}
         camera = self.microscope.camera(blur_sigma=0.0, **settings)
-        scene = Window(micrograph(sigma=spread), (SIZE + 2 * AROUND,) * 2)
+        scene = self.shown(micrograph(sigma=spread))
         return self.microscope.film(scene, motion, start_s=CAMERA_START_S, camera=camera, seed=self.seed)
+
+    def shown(self, scene: Scene) -> Scene:
+        """As much of the ``scene`` as the trackers read."""
+        return Window(scene, (SIZE + 2 * AROUND,) * 2)
+
+    def trackers(self, first: Tensor) -> dict[str, Callable[[Tensor], Estimate]]:
+        """What follows the template of the ``first`` frame (H, W), by name: a frame -> Estimate (1, ...)."""
+        return {name: tracker_of(first, **options) for name, options in self.methods.items()}
 
     def _track(
         self, film: Sequence, seconds: dict[str, float], tick: Callable[[], None]
     ) -> tuple[dict[str, Track], Tensor]:
         """Every method on the same frames, and the first frame (H, W)."""
         first = film.batch(0, 1)[0, 0]
-        trackers = {name: tracker_of(first, **options) for name, options in self.methods.items()}
+        trackers = self.trackers(first)
         found: dict[str, list[Estimate]] = {name: [] for name in trackers}
         for k in range(len(film)):
             with _timed(seconds, "frames"):

@@ -50,12 +50,13 @@ def errors_of(found: Staircase, name: str) -> list[Tensor]:
 
 
 def draw(errors: dict[str, list[Tensor]]) -> Figure:
-    """(a) CDS and (b) ECC, each with its own scale."""
-    figure = new_figure(11, 4.4)
-    for k, (axes, (name, steps)) in enumerate(zip(figure.subplots(1, 2), errors.items(), strict=True)):
+    """(a) CDS, (b) ECC and what else there is, each with its own scale."""
+    figure = new_figure(5.5 * len(errors), 4.4)
+    for k, (axes, (name, steps)) in enumerate(zip(figure.subplots(1, len(errors)), errors.items(), strict=True)):
         for x, step in enumerate(steps, 1):
             draw_box(axes, x, step)
-        draw_range(axes, MAIN_DEG[name])
+        if name in MAIN_DEG:
+            draw_range(axes, MAIN_DEG[name])
         label_steps(axes, LEVELS_DEG, rotation=45)
-        axes.set(title=letter(f"({'ab'[k]}) {name}"), xlabel="step (deg)", ylabel="mean error (deg)")
+        axes.set(title=letter(f"({'abc'[k]}) {name}"), xlabel="step (deg)", ylabel="mean error (deg)")
     return figure

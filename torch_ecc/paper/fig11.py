@@ -11,7 +11,12 @@ from torch_ecc.paper.result import Advance, Experiment, Number, Picture
 from torch_ecc.paper.steps import LAMP, LEVELS_DEG, METHODS, staircase, step_table
 from torch_ecc.plots.style import new_figure
 
-STYLES = {"ECC": ("o-", "#0072b2"), "ECC, gain": ("s--", "#56b4e9"), "SSD": ("^-", "#d55e00")}
+STYLES = {
+    "ECC": ("o-", "#0072b2"),
+    "ECC, gain": ("s--", "#56b4e9"),
+    "SSD": ("^-", "#d55e00"),
+    "body": ("^-", "#009e73"),
+}
 REMARKS = (
     f"The light falls off across the frame, and the lamp gains {100 * LAMP:.0f} % while the staircase rises and loses "
     'them again. ECC is the default, whose light may vary across the template; "gain" is the paper\'s.',

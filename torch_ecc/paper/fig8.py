@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from matplotlib.figure import Figure
 
 from torch_ecc.paper.acquisition import times
@@ -9,7 +11,7 @@ from torch_ecc.paper.result import Advance, Experiment, Number, Picture
 from torch_ecc.paper.steps import HIGHEST, METHODS, Staircase, staircase, step_table
 from torch_ecc.plots.style import new_figure
 
-CDS, ECC = "#d55e00", "#0072b2"
+COLOURS = {"CDS": "#d55e00", "ECC": "#0072b2", "body": "#009e73"}
 REMARKS = (
     "The stage turns less than commanded, and differently on the way back: hysteresis and compliance, which is why the "
     "sensors and not the commands are the reference.",
@@ -38,16 +40,19 @@ def run(quick: bool, advance: Advance) -> Experiment:
     return Experiment("fig8", "Fig. 8: angular trajectory", [picture], tables, records, REMARKS)
 
 
-def draw(found: Staircase) -> Figure:
-    """theta over time on the sensors' clock."""
+def draw(found: Staircase, methods: Sequence[str] = ("ECC",)) -> Figure:
+    """theta over time on the sensors' clock, of the sensors and by ``methods``."""
     figure = new_figure(9, 4.6)
     axes = figure.subplots()
     inset = axes.inset_axes((0.4, 0.08, 0.24, 0.34))
-    track, sensors = found.tracks["ECC"], found.sensors
-    ecc = (track.time_s + found.alignment.offset_s, track.pose[:, 2].rad2deg())
+    sensors, offset = found.sensors, found.alignment.offset_s
+    curves = {"CDS": (sensors.time_s, sensors.pose[:, 2].rad2deg())}
+    for name in methods:
+        track = found.tracks[name]
+        curves[name] = track.time_s + offset, track.pose[:, 2].rad2deg()
     for panel in (axes, inset):
-        panel.plot(sensors.time_s, sensors.pose[:, 2].rad2deg(), color=CDS, lw=1.1, label="CDS")
-        panel.plot(*ecc, color=ECC, lw=0.7, label="ECC")
+        for name, curve in curves.items():
+            panel.plot(*curve, color=COLOURS[name], lw=1.1 if name == "CDS" else 0.7, label=name)
     start, end = found.windows_s[HIGHEST].tolist()
     middle = float(found.mean_deg("CDS")[HIGHEST])
     inset.set(xlim=(start, end), ylim=(middle - 0.012, middle + 0.012))

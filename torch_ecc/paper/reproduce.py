@@ -18,7 +18,7 @@ from torch_ecc.paper.report import write_report
 from torch_ecc.paper.result import Advance, Experiment, environment, load_records, save_records
 from torch_ecc.plots.style import styled
 
-NAMES = ("fig2", "fig3", "fig4", "table1", *(f"fig{n}" for n in range(6, 14)), "robustness")
+NAMES = ("fig2", "fig3", "fig4", "table1", *(f"fig{n}" for n in range(6, 14)), "robustness", "body")
 RECORDS = "records.json"
 DPI = 130
 

@@ -6,14 +6,16 @@ Everything is checked before anything is rendered. The names of settings are tho
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from math import radians
+from dataclasses import dataclass, replace
+from math import hypot, radians
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torch_ecc.config import as_table, choose, fill, refuse_unknown
+from torch_ecc.records.lens import Lens
 from torch_ecc.sim.camera import motion
 from torch_ecc.sim.camera.camera import Camera
 from torch_ecc.sim.camera.dataset import read_poses
@@ -81,7 +83,7 @@ class Simulation:
 
     sequence: Sequence
     template: Template
-    truth: Tensor  # (F, 1, 3) px, px, rad: the poses of the template
+    truth: Tensor  # (F, 1, 3) px, px, rad: the poses of the template, as without a lens
     metadata: dict[str, Any]
 
 
@@ -98,9 +100,11 @@ def from_config(values: Mapping[str, Any], *, folder: Path | str = ".") -> Simul
     template = _template(values.get("template", {}), folder)
     scene = choose(SCENES, _table(values, "scene", "micrograph"), "[scene]", folder=folder)
     sequence = Sequence(scene, poses, camera, _seed(values.get("seed", 0)))
-    center = poses[0, :2].round() if template.center is None else poses.new_tensor(template.center)
-    truth = sequence.truth(center[None])
-    check_inside(truth, template.size, camera.size)
+    lens = camera.lens if isinstance(camera.lens, Lens) else None
+    origin = poses[0, :2] if lens is None else lens.distort(poses[0, :2])
+    center = origin.round() if template.center is None else poses.new_tensor(template.center)
+    truth = sequence.truth((center if lens is None else lens.undistort(center))[None])
+    check_inside(truth if lens is None else lens.distort_pose(truth), template.size, camera.size)
     x, y = center.tolist()
     metadata = {"config": dict(values), "template": {"size": list(template.size), "center": [x, y]}}
     return Simulation(sequence, Template(template.size, (x, y)), truth, metadata)
@@ -146,7 +150,19 @@ def read_camera(values: Any, light: Light | None, folder: Path) -> Camera:
         settings["noise_sigma"] = noise_sigma(variance)
     if settings.get("bits") == "float":
         settings["bits"] = None
-    return fill(Camera, settings, "[camera]", folder=folder, light=light, lens=None)
+    lens = settings.pop("lens", None)
+    camera = fill(Camera, settings, "[camera]", folder=folder, light=light, lens=None)
+    return camera if lens is None else replace(camera, lens=read_lens(lens, camera.size))
+
+
+def read_lens(values: Any, size: tuple[int, int]) -> Lens:
+    """The lens before a frame of ``size`` (h, w), about its middle and in units of half its diagonal unless told."""
+    middle = [(size[1] - 1) / 2, (size[0] - 1) / 2]
+    given = {"center": middle, "focal": hypot(*middle)} | dict(as_table(values, "[camera.lens]"))
+    lens = fill(Lens, given, "[camera.lens]")
+    corners = [[x, y] for x in (0, size[1] - 1) for y in (0, size[0] - 1)]
+    lens.check(torch.tensor(corners, dtype=torch.float64), "[camera.lens]")
+    return lens
 
 
 def _motion(values: Any, size: tuple[int, int], folder: Path) -> Tensor:
