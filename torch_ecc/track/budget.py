@@ -9,6 +9,7 @@ from __future__ import annotations
 from torch import Tensor
 
 BURST = 3000.0  # frames of credit at most, and at first
+RESERVE = 500.0  # of it that searches of the whole frame leave to those near, which cost a tenth
 LEAST_FRAME = 400_000  # pixels' worth that every frame takes, however small it is: it has to come from somewhere
 SOLVE = 20  # times the pixels of a template: its solve
 CORRELATION = 4  # times the pixels of a spectrum, for every angle
@@ -21,9 +22,9 @@ class Budget:
     def __init__(self, credit: Tensor, turn: Tensor, pixels: int, textured: int) -> None:
         self.credit, self.turn, self.frame = credit, turn, max(pixels + SOLVE * textured, LEAST_FRAME)
 
-    def left(self) -> bool:
-        """Whether there is any credit, which is BURST at most."""
-        return float(self.credit.clamp_(max=BURST)) > 0
+    def left(self, reserve: float = 0.0) -> bool:
+        """Whether there is any credit, which is BURST at most, beyond a ``reserve``."""
+        return float(self.credit.clamp_(max=BURST)) > reserve
 
     def spend(self, spectra: int, aligned: int) -> None:
         """On correlations with ``spectra`` values, and what it takes to align what they show, in pixels."""

@@ -306,7 +306,10 @@ class Tracker(nn.Module):
         images = [image.detach()]
         state["credit"].add_(self.income)
         estimate = self._within_reach(self._solve(image, images, start))
-        doubtful, past = any(suspect(estimate, state["score"])), Past.of(state)
+        past = Past.of(state)
+        if self.search and bool((strays := self._recovery.strays(estimate, start, past)).any()):
+            estimate = self._recovery.not_led_away(estimate, strays, start, past)
+        doubtful = any(suspect(estimate, state["score"]))
         if doubtful:
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
             estimate = self._within_reach(from_rest(reference, images[0], estimate, past, self.settings))
