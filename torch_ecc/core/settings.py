@@ -11,6 +11,8 @@ from typing import Self, TypeVar
 
 from torch_ecc.core.sampling import SAMPLERS
 
+BACKENDS = ("auto", "torch", "native", "fused")
+
 T = TypeVar("T")
 
 
@@ -33,7 +35,7 @@ class Settings:
     min_score: float = described(0.5, "below this correlation a template is lost")
     min_visible: float = described(0.25, "with less of its weight in sight a template is out of view")
     robust: bool = described(True, "blocks that do not fit, as of what covers a part of the template, count less")
-    backend: str = described("auto", "on a CPU; auto is native where that is installed", ("auto", "torch", "native"))
+    backend: str = described("auto", "auto is the fastest there is on a device", BACKENDS)
 
     @classmethod
     def of(cls, where: str, options: dict[str, str | float]) -> Self:
