@@ -26,7 +26,7 @@ CODE: dict[type[Criterion], int] = {SSD: -1, PaperECC: -2}
 def takes(reference: Reference, image: Tensor, settings: Settings) -> bool:
     """Whether the engine solves this: a built-in criterion and sampler, an image on the CPU in one of ``DTYPES``."""
     return (
-        settings.backend != "torch"
+        settings.backend in {"auto", "native"}
         and image.dtype in DTYPES
         and image.device.type == "cpu"
         and reference.place.radius.dtype == torch.float64  # float32 where it was prepared on Apple's MPS
@@ -52,7 +52,7 @@ def solve(
         raise ValueError("native: expected what it takes")
     how = DEGREE[settings.interpolation], settings.max_iterations, settings.tolerance, code
     if torch.compiler.is_compiling():
-        partial, found = operator.traced(library, image, start, reference.packed, how, trust)
+        partial, found = operator.traced(image, start, reference.packed, how, trust)
     else:
         partial, found = call(library, image, start, reference.packed, how, trust, reference.distortion)
     pose, error, iterations, gain, sums, total, moments = found

@@ -64,7 +64,7 @@ def solve(
         raise ValueError("fused: expected what it takes")
     how = DEGREE[settings.interpolation], settings.max_iterations, settings.tolerance, code
     if torch.compiler.is_compiling():
-        _, found = operator.traced(None, image, start, reference.packed, how, trust)
+        _, found = operator.traced(image, start, reference.packed, how, trust)
     else:
         found = call(image, start, reference.packed, how, trust, reference.distortion)
     pose, error, iterations, gain, sums, total, moments = found
@@ -78,4 +78,6 @@ def _counted(reference: Reference, moments: Tensor, trust: Trust | None) -> Norm
     anew = normal_equations(moments_of(moments, reference.K.shape[1]))
     if trust is not None:  # with it all of them are
         return anew
-    return each(lambda new, old: torch.where(partial.view(-1, *[1] * (old.dim() - 1)), new, old), anew, reference.normal)
+    return each(
+        lambda new, old: torch.where(partial.view(-1, *[1] * (old.dim() - 1)), new, old), anew, reference.normal
+    )

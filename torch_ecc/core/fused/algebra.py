@@ -5,23 +5,13 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from torch_ecc.core.fused.records import INFINITE, SLICE
-
+from torch_ecc.core.fused.records import INFINITE
 
 
 @triton.jit
 def picked(vector, k):
     """One number of a vector (16,)."""
     return tl.sum(tl.where(tl.arange(0, 16) == k, vector, 0.0))
-
-
-@triton.jit
-def numbers_of(vector, COUNT: tl.constexpr):
-    """The first COUNT numbers of a vector (16,), float32."""
-    numbers = ()
-    for k in tl.static_range(COUNT):
-        numbers = numbers + (tl.sum(tl.where(tl.arange(0, 16) == k, vector, 0.0)).to(tl.float32),)
-    return numbers
 
 
 @triton.jit
@@ -43,7 +33,7 @@ def finite(v):
 
 
 @triton.jit
-def stacked(columns, COUNT: tl.constexpr):
+def stacked(columns, COUNT: tl.constexpr, SLICE: tl.constexpr):
     """Columns (SLICE,) as a matrix (16, SLICE)."""
     k, matrix = tl.arange(0, 16)[:, None], tl.zeros((16, SLICE), tl.float32)
     for j in tl.static_range(COUNT):

@@ -11,8 +11,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from torch_ecc.core.fused.algebra import column_of, finite, inverted, picked, product, stacked
-from torch_ecc.core.fused.look import completed, summed
+from torch_ecc.core.fused.algebra import column_of, inverted, picked, product, stacked
 from torch_ecc.core.fused.patch import (
     columns,
     counted,
@@ -29,14 +28,12 @@ from torch_ecc.core.fused.records import (
     INFINITE,
     LARGEST_SCALE,
     LONGEST_STEP,
+    OF_LOOK,
     OF_MOMENTS,
     PAPER,
     PLACES,
     SECANT_RANGE,
-    SLICE,
     SMALL,
-    SUMS,
-    Look,
     Pixels,
     State,
     View,
@@ -44,45 +41,46 @@ from torch_ecc.core.fused.records import (
 )
 
 
-
 @triton.jit
 def solve(frames, smooth, fine, coarse, trusted, start, bend, answers, way):
-    """Program b: the template b, or the b-th of those that trust is about.
+    """Program b: the template b, or the b-th of those that trust is about. First without ``PARTIAL``, for those that
+    stay in sight and are trusted, of whose moments the first is then -1; with it for the others.
 
     A record with constants is an argument, never the value of a variable: that would make numbers of them.
     """
     b = tl.program_id(0).to(tl.int64)
-    k = b
+    k, left = b, b >= 0
     if trusted.SOME:
         k = tl.load(trusted.which + b)
-    first, last = one_of(coarse, trusted, k, b), one_of(fine, trusted, k, b)
-    state, bend = beginning(start + 3 * k), bend + 4 * k
-    if way.COARSER or smooth.DEGREE > 1:
+    elif way.PARTIAL:
+        left = tl.load(answers.moments + b * OF_MOMENTS) >= 0
+    if left:
+        first, last = one_of(coarse, trusted, k, b), one_of(fine, trusted, k, b)
+        state, well, bend, look = beginning(start + 3 * k), b >= 0, bend + 4 * k, answers.looks + b * OF_LOOK
         enough, some = tl.maximum(way.tolerance, COARSE_TOLERANCE), tl.maximum(way.most * 2 // 3, 1)
-        if way.most > 1:
-            state, _ = iterate(
-                View(frames.grey + k * frames.next, frames), Pixels(first, coarse, trusted), state, bend, enough, some, way)
-    finish(View(smooth.grey + k * smooth.next, smooth), Pixels(last, fine, trusted), state, bend, answers, way)
-
-
-@triton.jit
-def finish(frame, pixels, state, bend, answers, way):
-    """The second stage, and what there is to be said of the template."""
-    b = tl.program_id(0).to(tl.int64)
-    state, look = iterate(frame, pixels, state, bend, way.tolerance, way.most, way)
-    tl.store(answers.pose + 3 * b, state.x)
-    tl.store(answers.pose + 3 * b + 1, state.y)
-    tl.store(answers.pose + 3 * b + 2, state.theta)
-    tl.store(answers.error + b, state.error)
-    tl.store(answers.iterations + b, state.iterations)
-    tl.store(answers.gain + b, finite(picked(look.fit, 3)))
-    sums, total = answers.sums + b * SUMS * pixels.trusted.COUNT, answers.total + b * (SUMS + 3)
-    summed(frame, pixels, look, sums, total, way)
-    moments = answers.moments + b * OF_MOMENTS
-    if look.whole and not pixels.trusted.SOME:
-        tl.store(moments, -1.0)
-    else:
-        completed(frame, pixels, look, moments, way)
+        if (way.COARSER or smooth.DEGREE > 1) and way.most > 1:
+            there = Pixels(first, coarse, trusted)
+            state, well = iterate(
+                View(frames.grey + k * frames.next, frames), there, state, well, bend, look, enough, some, way
+            )
+        state, well = iterate(
+            View(smooth.grey + k * smooth.next, smooth),
+            Pixels(last, fine, trusted),
+            state,
+            well,
+            bend,
+            look,
+            way.tolerance,
+            way.most,
+            way,
+        )
+        tl.store(answers.pose + 3 * b, state.x)
+        tl.store(answers.pose + 3 * b + 1, state.y)
+        tl.store(answers.pose + 3 * b + 2, state.theta)
+        tl.store(answers.error + b, state.error)
+        tl.store(answers.iterations + b, state.iterations)
+        if not way.PARTIAL:
+            tl.store(answers.moments + b * OF_MOMENTS, tl.where(well, -1.0, 0.0))
 
 
 @triton.jit
@@ -94,26 +92,44 @@ def beginning(start):
 
 
 @triton.jit
-def iterate(frame, pixels, state, bend, tolerance, most, way):
-    """``solver.iterate``: the state, and the last look."""
+def iterate(frame, pixels, state, well, bend, look, tolerance, most, way):
+    """``solver.iterate``: the state, and whether all is ``well``: without ``PARTIAL`` no look may be out of sight. What
+    is seen is noted in the ``look``."""
     x, y, theta, dx, dy, dtheta, length, scale, _, iterations = state
     state = State(x, y, theta, dx, dy, dtheta, length, scale, tl.full((), INFINITE, tl.float64), iterations)
-    base, zero, empty = level(frame, x, y), tl.full((), 0, tl.float64), tl.zeros((16,), tl.float64)
-    warp = warp_of(state, bend)
-    look = Look(warp, in_sight(frame, pixels, warp), base, zero, empty, zero, zero, tl.zeros((16, 16), tl.float64))
-    while (state.error > tolerance) & (state.iterations < most):
+    base = level(frame, x, y)
+    while (state.error > tolerance) & (state.iterations < most) & well:
         warp = warp_of(state, bend)
         whole = in_sight(frame, pixels, warp)
         sums, square = added(frame, pixels, warp, whole, base, way)
-        if whole and not pixels.trusted.SOME:
-            weighted = known(pixels)
+        weighted = known(pixels)
+        if way.PARTIAL:
+            if pixels.trusted.SOME or not whole:
+                weighted = weighed(frame, pixels, warp, whole, way)
         else:
-            weighted = weighed(frame, pixels, warp, whole, way)
-        total, along, inverse = weighted.total, weighted.along, weighted.inverse
+            well = well & whole
         fit, step_x, step_y, step_theta = fitted(pixels, weighted, sums, square, base, way)
-        look = Look(warp, whole, base, picked(sums, 4) / tl.maximum(total, SMALL), fit, total, along, inverse)
-        state = advance(state, step_x, step_y, step_theta, total > 0, pixels.of.radius)
-    return state, look
+        noted(look, state, whole, base, picked(sums, 4) / tl.maximum(weighted.total, SMALL), weighted, fit)
+        state = advance(state, step_x, step_y, step_theta, weighted.total > 0, pixels.of.radius)
+    return state, well
+
+
+@triton.jit
+def noted(look, state, whole, base, mean, weighted, fit):
+    """Written down for ``look.summed``."""
+    i, whole = tl.arange(0, 16), tl.where(whole, 1.0, 0.0)
+    along = weighted.along / tl.maximum(weighted.total, SMALL)
+    tl.store(look, state.x)
+    tl.store(look + 1, state.y)
+    tl.store(look + 2, state.theta)
+    tl.store(look + 3, whole)
+    tl.store(look + 4, base)
+    tl.store(look + 5, mean)
+    tl.store(look + 6, weighted.total)
+    tl.store(look + 7, along)
+    tl.store(look + 8 + i, fit)
+    rows = i[:, None] < 3
+    tl.store(look + 24 + 16 * i[:, None] + i[None, :], weighted.inverse, mask=rows)
 
 
 @triton.jit
@@ -129,15 +145,17 @@ def known(pixels):
 @triton.jit
 def weighed(frame, pixels, warp, whole, way):
     """``Weighted`` of the pixels that are in sight, as their blocks are trusted: reference.restrict."""
-    matrix, zero = tl.zeros((16, 16), tl.float32), tl.zeros((SLICE,), tl.float32)
+    matrix, zero = tl.zeros((16, 16), tl.float32), tl.zeros((way.SLICE,), tl.float32)
     total, along, power = zero, zero, zero
-    for first in range(0, pixels.grid.HEIGHT * pixels.grid.PITCH, SLICE):
-        at = first + tl.arange(0, SLICE)
-        weight = counted(pixels, in_view(frame, pixels, warp, whole, at), at)
+    for first in range(0, pixels.grid.HEIGHT * pixels.grid.PITCH, way.SLICE):
+        at = first + tl.arange(0, way.SLICE)
+        weight = counted(pixels, in_view(frame, pixels, warp, whole, at, way), at)
         x, y = places(pixels, at)
-        x, y = x.to(tl.float32), y.to(tl.float32)
         R = columns(pixels, 1, at, x, y, way)
-        matrix += product(stacked(columns(pixels, 0, at, x, y, way), way.LINES) * weight[None, :], stacked(R, way.LINES))
+        matrix += product(
+            stacked(columns(pixels, 0, at, x, y, way), way.LINES, way.SLICE) * weight[None, :],
+            stacked(R, way.LINES, way.SLICE),
+        )
         total += weight
         along += weight * R[3]
         power += weight * R[3] * R[3]
@@ -158,9 +176,8 @@ def added(frame, pixels, warp, whole, base, way):
         sums = sums + (tl.zeros((way.PIXELS,), tl.float32),)
     for first in range(0, pixels.grid.HEIGHT * pixels.grid.PITCH, way.PIXELS):
         at = first + tl.arange(0, way.PIXELS)
-        weight = counted(pixels, in_view(frame, pixels, warp, whole, at), at)
+        weight = counted(pixels, in_view(frame, pixels, warp, whole, at, way), at)
         x, y = places(pixels, at)
-        x, y = x.to(tl.float32), y.to(tl.float32)
         e = tl.where(weight > 0, sampled(frame, warp, x, y) - base, 0.0)
         Z, we, more = columns(pixels, 0, at, x, y, way), weight * e, ()
         for k in tl.static_range(way.LINES):

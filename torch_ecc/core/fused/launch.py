@@ -10,8 +10,8 @@ import triton.language as tl
 from torch import Tensor
 
 from torch_ecc.core.entry import How
-from torch_ecc.core.fused import kernel
-from torch_ecc.core.fused.records import Answers, Frames, Grids, Trusted, Way
+from torch_ecc.core.fused import kernel, look
+from torch_ecc.core.fused.records import OF_LOOK, Answers, Frames, Grids, Trusted, Way
 from torch_ecc.core.native import DEGREE
 from torch_ecc.core.packed import Packed
 from torch_ecc.core.reference import BLOCK
@@ -23,24 +23,28 @@ MANY = 256  # templates, two for each processor of a large GPU
 
 
 class Shape(NamedTuple):
-    """Of a program: what it takes at a time, in pixels, and in blocks of them in the last look, and how many warps."""
+    """Of a program: what it takes at a time, see ``records.Way``, and how many warps."""
 
     pixels: int
     blocks: int
+    slice: int
     warps: int
 
 
-def shape_for(count: int) -> Shape:
-    """Few templates have whole processors for themselves; of many, several share one."""
-    return Shape(512, 64, 4) if count > MANY else Shape(2048, 256, 16)
+def shape_for(device: torch.device, count: int) -> Shape:
+    """Few templates have whole processors for themselves; of many, several share one. An interpreter's time is that of
+    its steps."""
+    if device.type == "cpu":
+        return Shape(2048, 512, 1024, 1)
+    return Shape(256, 16, 64, 4) if count > MANY else Shape(1024, 64, 64, 16)
 
 
 def call(
     image: Tensor, start: Tensor, packed: Packed, how: How, trust: Trust | None = None, distortion: Tensor | None = None
 ) -> list[Tensor]:
-    """``entry.FIELDS`` of the packed templates in (B or 1, 1, H, W) from ``start`` (B, 3), float64, on, or of those that
-    ``trust`` is about, seen with a ``distortion`` (B, 2, 2), float64. ``moments`` of those of which all pixels count
-    begin with -1."""
+    """``entry.FIELDS`` of the packed templates in (B or 1, 1, H, W) from ``start`` (B, 3), float64, on, or of those
+    that ``trust`` is about, seen with a ``distortion`` (B, 2, 2), float64. ``moments`` of those of which all pixels
+    count begin with -1."""
     degree, most, tolerance, code = how
     n = len(start if trust is None else trust.which)
     results = [result.new_empty((n, *result.shape[1:])) for result in packed.results]
@@ -49,11 +53,15 @@ def call(
         smooth = _frames(Sampler.of(image.float(), SAMPLER[degree]).values, degree, image.shape)
     grids = [_grids(packed, k) for k in range(len(packed.widths))]
     bend = start.new_zeros(len(start), 4) if distortion is None else distortion.contiguous()
-    shape, constants = shape_for(n), 5 + max(code, 0)
-    way = Way(tolerance, most, *_fixed(code, constants, 3 if code < 0 else constants, len(grids) > 1, *shape[:2]))
-    arguments = frames, smooth, grids[0], grids[-1], _trusted(trust, packed, start), start.contiguous(), bend
+    shape, constants = shape_for(image.device, n), 5 + max(code, 0)
+    fixed = code, constants, 3 if code < 0 else constants, len(grids) > 1, *shape[:3]
+    some, partial = (Way(tolerance, most, *_fixed(*fixed, either)) for either in (False, True))
+    trusted, answers = _trusted(trust, packed, start), Answers._make([*results, start.new_empty(n, OF_LOOK.value)])
     with torch.cuda.device(image.device) if image.is_cuda else nullcontext():
-        kernel.solve[(n,)](*arguments, Answers(*results), way, num_warps=shape.warps)
+        for way in (some, partial)[trust is not None :]:
+            every = trusted, start.contiguous(), bend, answers, way
+            kernel.solve[(n,)](frames, smooth, grids[0], grids[-1], *every, num_warps=shape.warps)
+        look.answer[(n,)](smooth, grids[0], trusted, bend, answers, partial, num_warps=shape.warps)
     return results
 
 

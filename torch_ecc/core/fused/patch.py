@@ -8,7 +8,6 @@ import triton.language as tl
 from torch_ecc.core.fused.records import FARTHEST, OF_NUMBERS, ROUNDING, SIDE, One, Warp
 
 
-
 @triton.jit
 def one_of(grids, trusted, k, b):
     """The template k, the b-th answer, of those on a grid."""
@@ -22,11 +21,11 @@ def one_of(grids, trusted, k, b):
 
 
 @triton.jit
-def warp_of(state, bend):
-    """R (I + D) x' + t, eq. (2)."""
-    c, s = tl.cos(state.theta), tl.sin(state.theta)
+def warp_of(pose, bend):
+    """R (I + D) x' + t, eq. (2), of a record with a pose."""
+    c, s = tl.cos(pose.theta), tl.sin(pose.theta)
     xu, xv, yu, yv = 1 + tl.load(bend), tl.load(bend + 1), tl.load(bend + 2), 1 + tl.load(bend + 3)
-    return Warp(c * xu + s * yu, c * xv + s * yv, c * yu - s * xu, c * yv - s * xv, state.x, state.y)
+    return Warp(c * xu + s * yu, c * xv + s * yv, c * yu - s * xu, c * yv - s * xv, pose.x, pose.y)
 
 
 @triton.jit
@@ -98,32 +97,36 @@ def taps(f, DEGREE: tl.constexpr):
 
 @triton.jit
 def cubic(v):
+    """Of the B-spline's outermost piece."""
     return v * v * v / 6
 
 
 @triton.jit
 def fifth(v):
+    """The same of the quintic one."""
     return v * v * v * v * v / 120
 
 
 @triton.jit
 def places(pixels, at):
-    """x' and y' of pixels by their numbers."""
-    x = pixels.of.left + (at % pixels.grid.PITCH * pixels.grid.STEP).to(tl.float64)
-    y = pixels.of.top + (at // pixels.grid.PITCH * pixels.grid.STEP).to(tl.float64)
+    """x' and y' of pixels by their numbers, float32."""
+    x = pixels.of.left.to(tl.float32) + (at % pixels.grid.PITCH * pixels.grid.STEP).to(tl.float32)
+    y = pixels.of.top.to(tl.float32) + (at // pixels.grid.PITCH * pixels.grid.STEP).to(tl.float32)
     return x, y
 
 
 @triton.jit
-def in_view(frame, pixels, warp, whole, at):
+def in_view(frame, pixels, warp, whole, at, way):
     """The weights of pixels, as far as they are in sight."""
     place = at
     if pixels.grid.EVEN:
         place = at % pixels.grid.PITCH
     weight = tl.load(pixels.of.weight + place, mask=at < pixels.grid.HEIGHT * pixels.grid.PITCH, other=0.0)
-    if not whole:
-        x, y = places(pixels, at)
-        weight = tl.where(inside(frame, warp, x, y), weight, 0.0)
+    if way.PARTIAL:
+        if not whole:
+            x = pixels.of.left + (at % pixels.grid.PITCH * pixels.grid.STEP).to(tl.float64)
+            y = pixels.of.top + (at // pixels.grid.PITCH * pixels.grid.STEP).to(tl.float64)
+            weight = tl.where(inside(frame, warp, x, y), weight, 0.0)
     return weight
 
 
@@ -132,7 +135,10 @@ def counted(pixels, seen, at):
     """The weights of pixels as their blocks are trusted."""
     weight = seen
     if pixels.trusted.SOME:
-        row, column = at // pixels.grid.PITCH * pixels.grid.STEP // SIDE, at % pixels.grid.PITCH * pixels.grid.STEP // SIDE
+        row, column = (
+            at // pixels.grid.PITCH * pixels.grid.STEP // SIDE,
+            at % pixels.grid.PITCH * pixels.grid.STEP // SIDE,
+        )
         weight *= tl.load(pixels.of.trust + row * pixels.trusted.ACROSS + column, mask=seen > 0, other=0.0)
     return weight
 

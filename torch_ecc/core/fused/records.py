@@ -20,13 +20,12 @@ SECANT_RANGE, LARGEST_SCALE = tl.constexpr(solver.SECANT_RANGE), tl.constexpr(so
 LONGEST_STEP, COARSE_TOLERANCE = tl.constexpr(solver.LONGEST_STEP), tl.constexpr(solver.COARSE_TOLERANCE)
 INFINITE, FARTHEST = tl.constexpr(inf), tl.constexpr(2.0**24)  # px: beyond it nothing is in sight
 PAPER = tl.constexpr(-2)  # a criterion in place of a number of light columns; SSD is -1
-SLICE = tl.constexpr(128)  # pixels whose columns are a matrix at a time
-
+OF_LOOK = tl.constexpr(8 + 4 * 16)
 
 
 class Frames(NamedTuple):
-    """``grey`` values of frames (I, h, w): pixels, or coefficients of their spline of ``DEGREE`` with a ring around them;
-    ``height`` and ``width`` of the frames, and the values from one template's to the next, 0 if all share one."""
+    """``grey`` values of frames (I, h, w): pixels, or coefficients of their spline of ``DEGREE`` with a ring around
+    them; ``height`` and ``width`` of the frames, and the values from one template's to the next, 0 if all share one."""
 
     grey: tl.tensor
     height: tl.tensor
@@ -66,7 +65,8 @@ class Trusted(NamedTuple):
 
 
 class Answers(NamedTuple):
-    """``entry.FIELDS``, all without gaps."""
+    """``entry.FIELDS``, all without gaps, and ``looks`` (n, OF_LOOK): the numbers of ``Look``, and, at 16 places each,
+    the model's fit to the patch and the first three rows of the inverse of Z W R^T."""
 
     pose: tl.tensor
     error: tl.tensor
@@ -75,10 +75,12 @@ class Answers(NamedTuple):
     sums: tl.tensor
     total: tl.tensor
     moments: tl.tensor
+    looks: tl.tensor
 
 
 class Way(NamedTuple):
-    """How to solve. ``PIXELS`` at a time are sampled, or those of ``BLOCKS`` in the last look."""
+    """How to solve. ``PIXELS`` at a time are sampled, or those of ``BLOCKS`` in the last look, and the columns of
+    ``SLICE`` pixels are one matrix."""
 
     tolerance: tl.tensor
     most: tl.tensor
@@ -88,6 +90,8 @@ class Way(NamedTuple):
     COARSER: tl.constexpr  # whether the first stage has a grid of its own
     PIXELS: tl.constexpr
     BLOCKS: tl.constexpr
+    SLICE: tl.constexpr
+    PARTIAL: tl.constexpr  # whether pixels may be out of sight or not trusted
 
 
 class One(NamedTuple):
@@ -151,14 +155,14 @@ class Weighted(NamedTuple):
 
 
 class Look(NamedTuple):
-    """At a patch g in a ``warp``, all of it in sight if it is ``whole``: what g is taken off, ``base``; the ``mean`` of
-    the rest, and the model's ``fit`` (16,) to it; the columns' weighted sums, see ``Weighted``."""
+    """At a patch g, all of it in sight if it is ``whole``: the pose, what g is taken off, ``base``, and the ``mean`` of
+    the rest, the sum of weights, and the mean of t less its own."""
 
-    warp: Warp
+    x: tl.tensor
+    y: tl.tensor
+    theta: tl.tensor
     whole: tl.tensor
     base: tl.tensor
     mean: tl.tensor
-    fit: tl.tensor
     total: tl.tensor
     along: tl.tensor
-    inverse: tl.tensor
