@@ -13,6 +13,8 @@ from torch_ecc.core import clinging, robust, sampling, solver, verdict
 
 settings.register_profile("untimed", parent=settings(), deadline=None)  # a busy machine is no failure
 settings.load_profile("untimed")
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # the fused engine's kernels, before they are imported
 torch.set_num_threads(1)  # small tensors: a second thread costs more than it brings
 
 

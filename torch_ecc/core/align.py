@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torch_ecc.core import implicit, native, robust, sight, solver
+from torch_ecc.core import fused, implicit, native, robust, sight, solver
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
@@ -93,6 +93,7 @@ def found(
     reference: Reference, image: Tensor, pose: Tensor, settings: Settings, memory: robust.Memory | None = None
 ) -> Solution:
     """What the engine for these B templates finds."""
-    engine = native.solve if native.takes(reference, image, settings) else solver.solve
+    fit = (engine.solve for engine in (native, fused) if engine.takes(reference, image, settings))
+    engine = next(fit, solver.solve)
     seeing = engine if reference.sight is None else partial(sight.solve, engine)
     return robust.solve(seeing, reference, image, pose, settings, memory)

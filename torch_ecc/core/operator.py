@@ -1,7 +1,7 @@
-"""``torch.ops.torch_ecc.solve``: the native engine as an operator that torch.compile and torch.export see.
+"""``torch.ops.torch_ecc.solve``: the compiled engines as an operator that torch.compile and torch.export see.
 
-Eager calls go to ``entry.call`` directly. Here nothing is known of the arguments: each is checked before a pointer is
-made of it, and refused with a sentence. The results are ``entry.FIELDS``.
+Eager calls go to ``entry.call`` and ``fused.launch.call`` directly. Here nothing is known of the arguments: each is
+checked before a pointer is made of it, and refused with a sentence. The results are ``entry.FIELDS``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.entry import DTYPES, FIELDS, How, call
-from torch_ecc.core.library import Library, load
+from torch_ecc.core.library import load
 from torch_ecc.core.packed import LANES, NUMBERS, PLANES, Packed
 from torch_ecc.core.solution import Trust
 
@@ -53,7 +53,7 @@ class Arguments(NamedTuple):
 
 
 def traced(
-    _: Library, image: Tensor, start: Tensor, packed: Packed, how: How, trust: Trust | None = None
+    image: Tensor, start: Tensor, packed: Packed, how: How, trust: Trust | None = None
 ) -> tuple[int, list[Tensor]]:
     """``entry.call`` by way of the operator; how many templates are partial is not known before it runs."""
     rest = (None, None) if trust is None else (trust.blocks, trust.which)
@@ -67,6 +67,14 @@ def on_a_cpu(*arguments: object) -> tuple[Tensor, ...]:
     if library is None:
         raise RuntimeError("torch_ecc.solve: there is no native engine here")
     return tuple(call(library, given.image, given.pose, given.packed, given[5:9], given.trusted)[1])
+
+
+def on_a_gpu(*arguments: object) -> tuple[Tensor, ...]:
+    """The same by the fused engine."""
+    from torch_ecc.core.fused.launch import call as launched  # which imports Triton
+
+    given = check(Arguments(*arguments))  # type: ignore[arg-type]
+    return tuple(launched(given.image, given.pose, given.packed, given[5:9], given.trusted))
 
 
 def without_values(*arguments: object) -> tuple[Tensor, ...]:
@@ -133,5 +141,6 @@ def _require(right: bool, words: str, got: object) -> None:
 _library = torch.library.Library("torch_ecc", "DEF")
 _library.define(SCHEMA)
 _library.impl("solve", on_a_cpu, "CPU")
+_library.impl("solve", on_a_gpu, "CUDA")
 _library.impl("solve", torch.library.fallthrough_kernel, "Autograd")  # nothing here has a gradient
 torch.library.register_fake("torch_ecc::solve", without_values, lib=_library)

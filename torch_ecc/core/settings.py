@@ -11,6 +11,8 @@ from typing import Self, TypeVar
 
 from torch_ecc.core.sampling import SAMPLERS
 
+BACKENDS = ("auto", "torch", "native", "fused")
+
 T = TypeVar("T")
 
 
@@ -24,7 +26,9 @@ def described(default: T, words: str, known: Collection[str] = (), example: obje
 class Settings:
     """How to iterate and when to believe the result.
 
-    A ``backend`` of "auto" or "native" is the native engine on a CPU or, where there is none and with a word, the page.
+    A ``backend`` of "auto" is the native engine on a CPU and the fused one on an NVIDIA GPU; "native" and "fused" are
+    one of them, and "torch" is the page, which also serves what an engine does not take (and, with a word, where no
+    native one is installed).
     """
 
     interpolation: str = described("bspline3", "how the frame is read between pixels; bilinear is fast", SAMPLERS)
@@ -33,7 +37,7 @@ class Settings:
     min_score: float = described(0.5, "below this correlation a template is lost")
     min_visible: float = described(0.25, "with less of its weight in sight a template is out of view")
     robust: bool = described(True, "blocks that do not fit, as of what covers a part of the template, count less")
-    backend: str = described("auto", "on a CPU; auto is native where that is installed", ("auto", "torch", "native"))
+    backend: str = described("auto", "auto: native on a CPU, fused on an NVIDIA GPU, else torch", BACKENDS)
 
     @classmethod
     def of(cls, where: str, options: dict[str, str | float]) -> Self:
