@@ -21,7 +21,7 @@ import lief
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from torch_ecc.core.build import TARGETS, Target, constants, digest, key
+from torch_ecc.core.native.build import TARGETS, Target, constants, digest, key
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -58,7 +58,7 @@ def unpacked(wheel: Path, target: Target, folder: Path) -> list[Path]:
     (about,) = folder.glob("*.dist-info/WHEEL")
     assert f"Tag: py3-none-{target.wheel}" in about.read_text().splitlines()
     assert "Root-Is-Purelib: false" in about.read_text().splitlines()
-    libraries = sorted((folder / "torch_ecc/core/libraries").iterdir())
+    libraries = sorted((folder / "torch_ecc/core/native/libraries").iterdir())
     assert sorted(path.name.split("-")[0] for path in libraries) == sorted(target.instructions)
     for path in libraries:
         assert path.stem.split("-")[1:] == [key(constants()), digest(path)], path.name
@@ -90,7 +90,7 @@ class Problem:
         import torch
 
         from torch_ecc import prepare
-        from torch_ecc.core import entry, library
+        from torch_ecc.core.native import entry, library
         from torch_ecc.sim.scene.scene import PlaneWaves
 
         poses = torch.tensor([[60.0, 50.0, 0.5], [100.0, 20.0, -1.0], [3.0, 60.0, 2.0], [900.0, 0.0, 0.0]]).double()

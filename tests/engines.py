@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from torch_ecc import ECC, SSD, PaperECC, prepare
-from torch_ecc.core import library, native, reference
+from torch_ecc.core import reference
+from torch_ecc.core.native import engine as native
+from torch_ecc.core.native import library
 from torch_ecc.core.reference import Reference
 from torch_ecc.sim.scene.scene import PlaneWaves
 
@@ -20,7 +22,7 @@ SCENE, OTHER = (PlaneWaves.random(seed=seed) for seed in (1, 9))
 CRITERIA = [ECC("gain"), ECC("linear"), ECC("quadratic"), SSD(), PaperECC()]
 SAMPLERS = ["bilinear", "bspline3", "bspline5"]
 
-compiled = pytest.mark.skipif(library.load() is None, reason="no native engine: python -m torch_ecc.core.build")
+compiled = pytest.mark.skipif(library.load() is None, reason="no native engine: python -m torch_ecc.core.native.build")
 BACKENDS = [pytest.param("native", marks=compiled), "torch"]
 
 

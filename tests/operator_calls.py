@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from torch_ecc import prepare
-from torch_ecc.core import native
+from torch_ecc.core.native import engine as native
 
 if sys.platform != "win32":  # where there is no fork either
     import resource

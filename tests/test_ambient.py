@@ -156,7 +156,7 @@ def caches() -> list:
     """Of constants, all but the compiled engine's."""
     names = [m.name for m in pkgutil.walk_packages(te.__path__, "torch_ecc.") if m.name.split(".")[1] in FLOORS]
     values = [value for name in names for value in vars(importlib.import_module(name)).values()]
-    return [v for v in values if hasattr(v, "cache_clear") and v.__module__ != "torch_ecc.core.library"]
+    return [v for v in values if hasattr(v, "cache_clear") and v.__module__ != "torch_ecc.core.native.library"]
 
 
 def forget() -> None:

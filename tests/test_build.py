@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from engines import compiled
 
-from torch_ecc.core import build, library
+from torch_ecc.core.native import build, library
 
 posix = pytest.mark.skipif(os.name != "posix", reason="for systems with owners and modes")
 TARGET = build.Target(build.X86, [], ".so")
@@ -66,7 +66,7 @@ def test_two_builds_at_once(compiler, tmp_path):
     """Each library is there as a whole, of one or of the other, whenever one looks."""
     compiler(COMPILER)
     code = (
-        "import sys; from pathlib import Path; from torch_ecc.core import build;"
+        "import sys; from pathlib import Path; from torch_ecc.core.native import build;"
         "[build.build(Path(sys.argv[1]), build.Target(build.X86, [], '.so')) for _ in range(4)]"
     )
     folder = tmp_path / "there"
@@ -209,7 +209,7 @@ def test_a_library_of_other_sources_is_refused(there, found):
     """As after a change of the checkout."""
     for path in there.iterdir():
         path.rename(path.with_name(path.name.replace(build.key(library.constants()), "0123456789ab")))
-    assert found() == f"the one in {there} is of other sources; `python -m torch_ecc.core.build` makes it"
+    assert found() == f"the one in {there} is of other sources; `python -m torch_ecc.core.native.build` makes it"
 
 
 @compiled
@@ -237,7 +237,7 @@ def test_without_a_library_torch_serves(tmp_path):
     """One clear line that says how to have one, and the same answer; none if the page is asked for."""
     code = """
 import pathlib, sys, torch, torch_ecc as te
-from torch_ecc.core import build
+from torch_ecc.core.native import build
 build.LIBRARIES = pathlib.Path(sys.argv[2])
 frame = torch.rand(60, 60)
 tracker = te.Tracker(frame, [(30, 30)], 21, backend=sys.argv[1])
@@ -252,4 +252,4 @@ print(pose.round().abs().tolist())
         assert run.stdout.strip() == "[[30.0, 30.0, 0.0]]"
         lines = [line for line in run.stderr.splitlines() if "torch page serves" in line]
         assert len(lines) == (backend != "torch")
-        assert all("python -m torch_ecc.core.build" in line for line in lines)
+        assert all("python -m torch_ecc.core.native.build" in line for line in lines)

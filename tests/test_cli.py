@@ -21,7 +21,7 @@ import torch_ecc
 from torch_ecc import cli
 from torch_ecc.cli import app, main, progress_bar
 from torch_ecc.commands.track import Session, TrackJob
-from torch_ecc.core import library
+from torch_ecc.core.native import library
 from torch_ecc.sim.scene.waves import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=2)

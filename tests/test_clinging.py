@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_ecc import Status, align, prepare
 from torch_ecc.core.blocks import STRAINS
 from torch_ecc.core.clinging import clinging, patterns, scale_of, without_strain
-from torch_ecc.core.native import solve as native
+from torch_ecc.core.native.engine import solve as native
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import solve
 from torch_ecc.sim import Pads, PlaneWaves

@@ -18,7 +18,9 @@ import torch
 from engines import CRITERIA, FRAME, SCENE, Problem, compiled
 
 from torch_ecc import ECC, SSD, PaperECC, Status, Tracker, align, prepare
-from torch_ecc.core import entry, native, reference
+from torch_ecc.core import reference
+from torch_ecc.core.native import engine as native
+from torch_ecc.core.native import entry
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Trust
 

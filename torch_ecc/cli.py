@@ -46,7 +46,7 @@ def _say_version(context: click.Context, _: click.Parameter, wanted: bool) -> No
         return
     import torch
 
-    from torch_ecc.core.library import describe
+    from torch_ecc.core.native.library import describe
 
     console.print(f"torch-ecc {torch_ecc.__version__}, torch {torch.__version__}, engine: {describe()}", soft_wrap=True)
     context.exit()

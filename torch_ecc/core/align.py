@@ -7,10 +7,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torch_ecc.core import fused, implicit, native, robust, sight, solver
+from torch_ecc.core import fused, implicit, robust, sight, solver
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
+from torch_ecc.core.native import engine as native
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution

@@ -59,9 +59,8 @@ def normal_equations(sums: Moments) -> Normal:
     rows, block = inverse[:, :3], inverse[:, :3, :3]
     spread = rows @ sums.power @ rows.mT
     bread = torch.where(regular[:, None, None], inverse_where(regular, block), 0.0)
-    bread_bias, meat_bias = (
-        errors_in_variables(q) * response for q, response in zip(sums.noise.unbind(1), NOISE_RESPONSE, strict=True)
-    )
+    biases = errors_in_variables(sums.noise.flatten(0, 1)).view(-1, 2, 3, 3).unbind(1)
+    bread_bias, meat_bias = (bias * response for bias, response in zip(biases, NOISE_RESPONSE, strict=True))
     total, along, count = sums.gram[:, 0, 0], sums.gram[:, 0, 3], sums.number.clamp(min=1)
     energy = (sums.gram[:, 3, 3] - along * along / total.clamp(min=LEAST)).clamp(min=0)
     return Normal(

@@ -34,7 +34,7 @@ from torch_ecc.core.pose import pose_dtype, rotation
 from torch_ecc.core.sampling import SAMPLERS, aliasing, blur, gradients, pad
 
 if TYPE_CHECKING:
-    from torch_ecc.core.packed import Packed
+    from torch_ecc.core.native.packed import Packed
     from torch_ecc.core.verdict import Known
 
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
@@ -162,7 +162,7 @@ class Reference(_Groups):
     @lasting
     def packed(self) -> Packed:
         """The templates in 16 bits, for a compiled engine: made once for as long as the reference lives."""
-        from torch_ecc.core.packed import pack  # which needs to know what a reference is
+        from torch_ecc.core.native.packed import pack  # which needs to know what a reference is
 
         return pack(self)
 

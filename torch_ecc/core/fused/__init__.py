@@ -14,9 +14,9 @@ from os import environ
 import torch
 from torch import Tensor
 
-from torch_ecc.core import operator
-from torch_ecc.core.entry import DTYPES
-from torch_ecc.core.native import DEGREE, code_of, moments_of
+from torch_ecc.core.native import operator
+from torch_ecc.core.native.engine import DEGREE, code_of, moments_of
+from torch_ecc.core.native.entry import DTYPES
 from torch_ecc.core.normal import Normal, normal_equations
 from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.settings import Settings

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import triton.language as tl
 
 from torch_ecc.core import sampling, solution, solver
+from torch_ecc.core.native.packed import MOMENTS, MOST, NUMBERS
 from torch_ecc.core.normal import LEAST
-from torch_ecc.core.packed import MOMENTS, MOST, NUMBERS
 from torch_ecc.core.reference import BLOCK, LEVELS
 
 SIDE, SUMS, PLACES = tl.constexpr(BLOCK), tl.constexpr(solution.SUMS), tl.constexpr(MOST)

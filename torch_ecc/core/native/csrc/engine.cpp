@@ -1,5 +1,5 @@
 // torch_ecc_solve, the one entry: the loop of core/solver.py for templates on the CPU, in parallel over them. All that is
-// pointed to has been checked by its only callers, core/native.py and core/operator.py.
+// pointed to has been checked by its only callers, engine.py and operator.py.
 #include "pool.h"
 #include "solve.h"
 

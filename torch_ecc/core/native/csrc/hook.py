@@ -13,9 +13,9 @@ from pathlib import Path
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-sys.path.insert(0, str(Path(__file__).parents[3]))
+sys.path.insert(0, str(Path(__file__).parents[4]))
 
-from torch_ecc.core.build import LIBRARIES, TARGETS, ZIG, BuildError, build, here
+from torch_ecc.core.native.build import LIBRARIES, TARGETS, ZIG, BuildError, build, here
 
 
 class EngineHook(BuildHookInterface):
@@ -41,7 +41,7 @@ class EngineHook(BuildHookInterface):
         build_data |= {"pure_python": False, "tag": f"py3-none-{platform}"}
         if version != "editable":
             build_data["force_include"] |= {
-                str(path): f"torch_ecc/core/{LIBRARIES.name}/{path.name}" for path in libraries
+                str(path): f"torch_ecc/core/native/{LIBRARIES.name}/{path.name}" for path in libraries
             }
 
     def finalize(self, version: str, build_data: dict, artifact_path: str) -> None:

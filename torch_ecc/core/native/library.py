@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import torch
 
-from torch_ecc.core import build
+from torch_ecc.core.native import build
 
 # What torch itself says of the processor; another one takes the first.
 SUITABLE = {"AVX2": ["AVX2", "baseline"], "AVX512": ["AVX512", "AVX2", "baseline"]}
@@ -62,7 +62,7 @@ def _find(folder: Path) -> tuple[str, Path]:
         fit = [path for path in there if path.name.startswith(f"{kind}-{key}-")]
         if fit:
             return kind, max(fit, key=lambda path: path.stat().st_mtime)
-    again = "`python -m torch_ecc.core.build` makes it"
+    again = "`python -m torch_ecc.core.native.build` makes it"
     if there:
         raise UnfitError(f"the one in {folder} is of other sources; {again}")
     raise UnfitError(f"none was installed; {again}, with {build.HINT}")

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.core.entry import DTYPES, FIELDS, How, call
-from torch_ecc.core.library import load
-from torch_ecc.core.packed import LANES, NUMBERS, PLANES, Packed
+from torch_ecc.core.native.entry import DTYPES, FIELDS, How, call
+from torch_ecc.core.native.library import load
+from torch_ecc.core.native.packed import LANES, NUMBERS, PLANES, Packed
 from torch_ecc.core.solution import Trust
 
 SCHEMA = (

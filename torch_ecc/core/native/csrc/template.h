@@ -1,4 +1,4 @@
-// A template as the loop reads it (core/packed.py): whole rows of 16-bit pixels, from which all columns of its criterion
+// A template as the loop reads it (packed.py): whole rows of 16-bit pixels, from which all columns of its criterion
 // are made.
 //
 // With Z the instruments and R the columns of criteria.py, K = (Z W R^T)^-1 Z W. Z and R are made of three images each

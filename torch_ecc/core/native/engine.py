@@ -8,12 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_ecc.core import operator
 from torch_ecc.core.criteria import ECC, SSD, Criterion, PaperECC
-from torch_ecc.core.entry import DTYPES, call
-from torch_ecc.core.library import load
+from torch_ecc.core.native import operator
+from torch_ecc.core.native.entry import DTYPES, call
+from torch_ecc.core.native.library import load
+from torch_ecc.core.native.packed import MOST
 from torch_ecc.core.normal import Moments, Normal, normal_equations
-from torch_ecc.core.packed import MOST
 from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution, Trust

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import threads_of_caller
-from torch_ecc.core.library import Library
-from torch_ecc.core.packed import Packed
+from torch_ecc.core.native.library import Library
+from torch_ecc.core.native.packed import Packed
 from torch_ecc.core.solution import Trust
 
 DTYPES = (torch.uint8, torch.uint16, torch.float32)  # of images

@@ -1,4 +1,6 @@
-"""Compile the native engine, ``csrc``: ``python -m torch_ecc.core.build`` for a checkout, ``csrc/hook.py`` for a wheel.
+"""Compile the native engine, ``csrc``.
+
+``python -m torch_ecc.core.native.build`` does it for a checkout, ``csrc/hook.py`` for a wheel.
 
 One library for each set of instructions that a processor of the target may have; which of them serves is chosen where
 it is loaded (``library``). Any C++20 compiler with vector extensions will do; CXX names one. Needs no torch.
@@ -25,10 +27,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 HERE = Path(__file__).parent
-SOURCES, LIBRARIES = HERE / "csrc", HERE / "libraries"
+SOURCES, LIBRARIES, CORE = HERE / "csrc", HERE / "libraries", HERE.parent
 SECONDS = 600  # a compiler that takes longer is given up
 CONSTANTS = {  # of the Python modules, for the C++
-    "packed": ["MOST", "PLANES", "NUMBERS", "MOMENTS"],
+    "native.packed": ["MOST", "PLANES", "NUMBERS", "MOMENTS"],
     "reference": ["BLOCK", "LEVELS"],
     "sampling": ["ROUNDING"],
     "solution": ["CLUSTERS", "FLAT", "SUMS"],
@@ -101,7 +103,7 @@ def constants() -> dict[str, float]:
     """Read from the modules' source: where an installation is built there is no torch to import them with."""
     found = {}
     for module, names in CONSTANTS.items():
-        for node in ast.parse((HERE / f"{module}.py").read_text()).body:
+        for node in ast.parse((CORE / f"{module.replace('.', '/')}.py").read_text()).body:
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id in names:
                 found[f"ECC_{node.targets[0].id}"] = eval(compile(ast.Expression(node.value), module, "eval"))
     return found
