@@ -17,7 +17,7 @@ CONSTANT = "constexpr"
 FRAMES = Frames("*u8", "i32", "i32", "i32", CONSTANT), [1]
 SMOOTH = Frames("*fp32", "i32", "i32", "i32", CONSTANT), [3]
 GRIDS = Grids("*i16", "*fp32", "*fp64", *5 * (CONSTANT,)), [31, 31, 32, 1, True]
-TRUSTED = Trusted("*i64", "*fp32", *3 * (CONSTANT,)), [6, 36, False]
+TRUSTED = Trusted("*i64", "*fp32", *4 * (CONSTANT,)), [6, 36, 8, False]
 ANSWERS = Answers("*fp64", "*fp64", "*i64", "*fp64", "*fp32", "*fp64", "*fp64", "*fp64"), []
 
 

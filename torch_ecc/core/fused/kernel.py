@@ -214,7 +214,7 @@ def fitted(pixels, weighted, sums, square, base, way):
 
 @triton.jit
 def advance(state, step_x, step_y, step_theta, seen, radius):
-    """``solver.advance``."""
+    """``step.advance``."""
     delta_theta, last = step_theta * radius, state.length
     length = tl.sqrt(step_x * step_x + step_y * step_y + delta_theta * delta_theta)
     moving = seen & (length < INFINITE)

@@ -84,7 +84,9 @@ def _grids(packed: Packed, k: int) -> Grids:
 
 def _trusted(trust: Trust | None, packed: Packed, start: Tensor) -> Trusted:
     """All of them, whole, if there is none: then nothing is read of it."""
-    fixed = _fixed(-(-packed.widths[0] // BLOCK), packed.results[4].shape[2], trust is not None)
+    across, count = -(-packed.widths[0] // BLOCK), packed.results[4].shape[2]
+    lines = 1 << (max(across, count // across) - 1).bit_length()
+    fixed = _fixed(across, count, lines, trust is not None)
     if trust is None:
         return Trusted(start, start, *fixed)
     return Trusted(trust.which.contiguous(), trust.blocks.contiguous(), *fixed)

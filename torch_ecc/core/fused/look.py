@@ -8,6 +8,7 @@ import triton.language as tl
 from torch_ecc.core.fused.algebra import finite, product, stacked
 from torch_ecc.core.fused.patch import columns, counted, in_view, one_of, places, sampled, warp_of
 from torch_ecc.core.fused.records import (
+    CLUSTERS,
     FLAT,
     OF_LOOK,
     OF_MOMENTS,
@@ -32,7 +33,7 @@ def answer(smooth, fine, trusted, bend, answers, way):
     x, y, theta, whole = tl.load(n), tl.load(n + 1), tl.load(n + 2), tl.load(n + 3) > 0
     look = Look(x, y, theta, whole, tl.load(n + 4), tl.load(n + 5), tl.load(n + 6), tl.load(n + 7))
     tl.store(answers.gain + b, finite(tl.load(n + 11)))
-    sums, total = answers.sums + b * SUMS * trusted.COUNT, answers.total + b * (SUMS + 3)
+    sums, total = answers.sums + b * SUMS * trusted.COUNT, answers.total + b * (SUMS + CLUSTERS)
     moments, bend = answers.moments + b * OF_MOMENTS, bend + 4 * k
     describe(
         View(smooth.grey + k * smooth.next, smooth),
@@ -120,12 +121,12 @@ def summed(frame, pixels, look, warp, model_at, sums, totals, way):
     """``solution.summed`` of the last look: sums (10, COUNT) over blocks, and their total."""
     COUNT: tl.constexpr = pixels.trusted.COUNT
     total, model = (), (numbers_at(model_at, way.LINES),)
-    for _ in tl.static_range(SUMS + 3):
+    for _ in tl.static_range(SUMS):
         total = total + (tl.zeros((way.BLOCKS,), tl.float64),)
     for k in tl.static_range(1, 4):
         model = model + (numbers_at(model_at + 16 * k, way.COLUMNS),)
     for first in range(0, COUNT, way.BLOCKS):
-        block, more, squares = first + tl.arange(0, way.BLOCKS), (), ()
+        block, more = first + tl.arange(0, way.BLOCKS), ()
         trust = tl.full((way.BLOCKS,), 1, tl.float32)
         if pixels.trusted.SOME:
             trust = tl.load(pixels.of.trust + block, mask=block < COUNT, other=0.0)
@@ -135,10 +136,12 @@ def summed(frame, pixels, look, warp, model_at, sums, totals, way):
             if k < SUMS - 3:
                 more = more + (total[k] + (of_blocks[k] * trust).to(tl.float64),)
             else:  # K is less where there is less trust
-                of_block = of_blocks[k].to(tl.float64)
-                more, squares = more + (total[k] + of_block,), squares + (total[k + 3] + of_block * of_block,)
-        total = more + squares
+                more = more + (total[k] + of_blocks[k].to(tl.float64),)
+        total = more
+    tl.debug_barrier()  # what others have stored is read again
     concluded(look, total, sums, totals, COUNT)
+    for k in tl.static_range(3):
+        clustered(sums + (SUMS - 3 + k) * COUNT, totals + SUMS + k, pixels.trusted)
 
 
 @triton.jit
@@ -146,16 +149,27 @@ def concluded(look, total, sums, totals, COUNT: tl.constexpr):
     """The total of the sums. Of a patch that is flat but for rounding g0 is 0."""
     level, power = look.mean + look.base, tl.sum(total[2])
     rough = power > FLAT * (power + level * level * look.total)
-    for k in tl.static_range(SUMS + 3):
+    for k in tl.static_range(SUMS):
         value = finite(tl.sum(total[k]))
         if (k >= 1) and (k <= 5):
             value = tl.where(rough, value, 0.0)
         tl.store(totals + k, value)
     if not rough:
-        tl.debug_barrier()
         for first in range(COUNT, 6 * COUNT, 1024):
             at = first + tl.arange(0, 1024)
             tl.store(sums + at, 0.0, mask=at < 6 * COUNT)
+
+
+@triton.jit
+def clustered(effect, out, trusted):
+    """``solution.clustered`` of one of three effects (COUNT,): square sums over blocks, rows and columns of them."""
+    i, j = tl.arange(0, trusted.LINES)[:, None], tl.arange(0, trusted.LINES)[None, :]
+    there = (j < trusted.ACROSS) & (i < trusted.COUNT // trusted.ACROSS)
+    value = tl.load(effect + i * trusted.ACROSS + j, mask=there, other=0.0).to(tl.float64)
+    in_row, in_column = tl.sum(value, 1), tl.sum(value, 0)
+    tl.store(out, finite(tl.sum(value * value)))
+    tl.store(out + 3, finite(tl.sum(in_row * in_row)))
+    tl.store(out + 6, finite(tl.sum(in_column * in_column)))
 
 
 @triton.jit

@@ -8,16 +8,17 @@ from typing import NamedTuple
 
 import triton.language as tl
 
-from torch_ecc.core import sampling, solution, solver
+from torch_ecc.core import sampling, solution, solver, step
 from torch_ecc.core.native.packed import MOMENTS, MOST, NUMBERS
 from torch_ecc.core.normal import LEAST
 from torch_ecc.core.reference import BLOCK, LEVELS
 
-SIDE, SUMS, PLACES = tl.constexpr(BLOCK), tl.constexpr(solution.SUMS), tl.constexpr(MOST)
+SIDE, PLACES = tl.constexpr(BLOCK), tl.constexpr(MOST)
+SUMS, CLUSTERS = tl.constexpr(solution.SUMS), tl.constexpr(solution.CLUSTERS)
 OF_NUMBERS, OF_MOMENTS, STEPS = tl.constexpr(NUMBERS), tl.constexpr(MOMENTS), tl.constexpr(LEVELS)
 ROUNDING, FLAT, SMALL = tl.constexpr(sampling.ROUNDING), tl.constexpr(solution.FLAT), tl.constexpr(LEAST)
-SECANT_RANGE, LARGEST_SCALE = tl.constexpr(solver.SECANT_RANGE), tl.constexpr(solver.LARGEST_SCALE)
-LONGEST_STEP, COARSE_TOLERANCE = tl.constexpr(solver.LONGEST_STEP), tl.constexpr(solver.COARSE_TOLERANCE)
+SECANT_RANGE, LARGEST_SCALE = tl.constexpr(step.SECANT_RANGE), tl.constexpr(step.LARGEST_SCALE)
+LONGEST_STEP, COARSE_TOLERANCE = tl.constexpr(step.LONGEST_STEP), tl.constexpr(solver.COARSE_TOLERANCE)
 INFINITE, FARTHEST = tl.constexpr(inf), tl.constexpr(2.0**24)  # px: beyond it nothing is in sight
 PAPER = tl.constexpr(-2)  # a criterion in place of a number of light columns; SSD is -1
 OF_LOOK = tl.constexpr(8 + 4 * 16)
@@ -61,6 +62,7 @@ class Trusted(NamedTuple):
     blocks: tl.tensor
     ACROSS: tl.constexpr
     COUNT: tl.constexpr
+    LINES: tl.constexpr  # a power of two, no less than rows or columns of blocks
     SOME: tl.constexpr  # False: all templates are whole
 
 
