@@ -10,9 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 from adapters import Start
-from films.shot import Film, Shot, sense
-from films.soak import soak_film, stream
-from scaling import peak_mb
+from films.shot import Film
 from torch import Tensor
 
 from torch_ecc import Estimate, Origin, Status, Track, Tracker
@@ -78,24 +76,6 @@ def follow(film: Film, **options: Any) -> Run:
         estimates.append(tracker(frame))
         seconds.append(time.perf_counter() - begun)
     return Run.of(film, Track.stack(estimates), torch.tensor(seconds))
-
-
-def soak(shot: Shot, count: int, **options: Any) -> tuple[Run, float]:
-    """The Tracker on ``count`` frames of a stream, and by how many MB its peak memory grew after the first tenth."""
-    start, settled = sense(shot.clean[:1], shot.seed)[0], 0.0
-    tracker = Tracker(start, shot.path[:1, :2], shot.size, **options)
-    truth, (seen, seconds) = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(2, count)
-    told: list[Tensor] = []
-    for k, (frame, truth[k], seen[k]) in enumerate(stream(shot, count)):
-        begun = time.perf_counter()
-        estimate = tracker(frame)
-        seconds[k] = time.perf_counter() - begun
-        if k == 0:  # all memory of its own is taken before it is measured
-            told = [torch.zeros(count, *value.shape, dtype=value.dtype) for value in estimate]
-        for values, value in zip(told, estimate, strict=True):
-            values[k] = value
-        settled = peak_mb() if k == count // 10 else settled
-    return Run.of(soak_film(shot, truth, seen), Track(*told), seconds), peak_mb() - settled
 
 
 def follow_peer(film: Film, start: Start) -> Run:

@@ -37,14 +37,12 @@ import click
 import torch
 from films import cameras, covers, disturbed, repeats, weak
 from films.shot import SCENES, Film, Shot
-from honesty import BY, Run, figures, follow, follow_peer, numbers, soak, worst
+from honesty import BY, Run, figures, follow, follow_peer, numbers, worst
 from results import save
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from rivals import rivals
-
-from torch_ecc.paper.result import Number
 
 SHARES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 ARRAYS = 25  # of each kind
@@ -187,26 +185,11 @@ def show_worst(runs: Runs, count: int) -> None:
     console.print(table)
 
 
-def soaked(count: int, by: Iterable[str]) -> tuple[Runs, list[Number]]:
-    """The run over ``count`` frames without end, and how memory grew."""
-    runs: Runs = {}
-    growth = []
-    for how in by:
-        if how != "opencv":
-            title = "soak" if how == "default" else f"soak, {how}"
-            run, grown = soak(Shot(SCENES["waves"](0)), count, **BY[how])
-            runs[title] = [run]
-            growth.append(Number(f"{title} / memory growth", grown, "MB", "lower"))
-            console.print(f"{title}: {count} frames, {grown:.1f} MB more after the first tenth of them")
-    return runs, growth
-
-
 @click.command()
 @click.option("--rows", "words", multiple=True, help="only rows with these words in their name")
 @click.option("--scenes", default=1, show_default=True, help="of each family")
 @click.option("--by", multiple=True, default=("default",), type=click.Choice([*BY, "opencv"]), show_default=True)
 @click.option("--quick", is_flag=True, help="waves and pads only, and a tenth of the arrays")
-@click.option("--soak", "soak_frames", default=2000, show_default=True, help="frames of the soak")
 @click.option("--worst", "listed", default=0, show_default=True, help="frames of each row to tell all of")
 @click.option("--data", type=click.Path(path_type=Path), default=os.environ.get("TORCH_ECC_DATA"))
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
@@ -215,7 +198,6 @@ def main(
     scenes: int,
     by: tuple[str, ...],
     quick: bool,
-    soak_frames: int,
     listed: int,
     data: Path | None,
     out: Path | None,
@@ -223,25 +205,21 @@ def main(
     """Count what is believed and wrong."""
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
     rows, own = disturbances(), worlds(2 if quick else ARRAYS, data)
-    wanted = {name for name in (*rows, *own, "soak") if not words or any(word in name for word in words)}
+    wanted = {name for name in (*rows, *own) if not words or any(word in name for word in words)}
     if not wanted:
-        raise click.UsageError(
-            f"no row has {' or '.join(words)} in its name; known are {', '.join((*rows, *own, 'soak'))}"
-        )
+        raise click.UsageError(f"no row has {' or '.join(words)} in its name; known are {', '.join((*rows, *own))}")
     families = list(SCENES)[:2] if quick else list(SCENES)
     runs: Runs = {}
     films = chain(filmed(rows, wanted, shots(scenes, families)), made(own, wanted))
     with suppress(KeyboardInterrupt):  # what there is by then is shown
         for name, film in track(films, "films", console=Console(stderr=True), transient=True):
             followed(runs, name, film, by)
-    more, growth = soaked(soak_frames, by) if "soak" in wanted else ({}, [])
-    runs |= more
     found = {title: figures(some) for title, some in runs.items()}
     show(found)
     if listed:
         show_worst(runs, listed)
     if out is not None:
-        save(out, [n for title, row in found.items() for n in numbers(title, row)] + growth)
+        save(out, [n for title, row in found.items() for n in numbers(title, row)])
 
 
 if __name__ == "__main__":

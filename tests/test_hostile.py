@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import honesty
 import hostile
+import soak
 from films import covers, disturbed, repeats
 from films.shot import SCENES, Film, Shot, eq11, frames, visible_bound
 from results import load
@@ -112,3 +113,18 @@ def test_one_row_by_one_command(tmp_path: Path) -> None:
     refused = CliRunner().invoke(hostile.main, ["--rows", "no such row"])
     assert refused.exit_code == 2
     assert "known are none, cover 5 %" in refused.output
+
+
+def test_a_soak_can_begin_anew_from_a_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the same frames, of which it tells the same."""
+    monkeypatch.setattr(soak, "EVERY", 40)
+    arguments, found = ["--family", "waves", "--frames", "80", "--states", str(tmp_path)], []
+    for more in ([], ["--first", "40"]):
+        out = tmp_path / "soak.json"
+        done = CliRunner().invoke(soak.main, [*arguments, *more, "--out", str(out)])
+        assert done.exit_code == 0, done.output
+        found.append([line.rsplit(",", 2)[0] for line in done.output.splitlines() if "frames" in line])
+        assert load(out).figures["waves 0 / wrong"].value == 0
+    truth = [soak.figures(soak.Soak.of("waves", 0, (0, 80), 61).run()[0][k:])["converged"] for k in (0, 1)]
+    assert f"converged {truth[0]}," in found[0][1]
+    assert f"converged {truth[1]}," in found[1][0]

@@ -163,7 +163,7 @@ def test_how_many_are_searched_for_in_one_frame(monkeypatch):
     frame = shots(fine(), (0, 0, 0))[0]
     tracker = Tracker(frame, grid(9), 21)
     for k in range(3):
-        tracker(torch.zeros_like(frame))
+        tracker(255 * torch.rand(frame.shape))
         assert len(near[k]) == NEARBY_AT_ONCE
         assert len(whole) == AT_ONCE * (k + 1)
     assert len(set(whole)) == 3 * AT_ONCE

@@ -16,13 +16,14 @@ from torch_ecc.core.pose import compose
 from torch_ecc.io import open_frames
 from torch_ecc.sim.scene.scene import PlaneWaves
 from torch_ecc.track.advance import FARTHEST, beginning, coast
-from torch_ecc.track.budget import Budget
+from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.recover import Recovery, common_motion, gone_together
+from torch_ecc.track.recover import Past, Recovery, common_motion, gone_together
 
 FRAME = (240, 320)
 Y, X = np.mgrid[0 : FRAME[0], 0 : FRAME[1]].astype(float)
 SCENE = PlaneWaves.random(seed=5)
+RNG = np.random.default_rng(5)
 
 
 def edge(distance):
@@ -361,15 +362,72 @@ def test_searches_take_no_more_than_their_share(monkeypatch):
     monkeypatch.setattr(
         Recovery, "search_anywhere", lambda self, i, e, p, r: (searched.append(r), self.budget.spend(10**7, 0), e)[2]
     )
-    stack = still((0, 0, 0), start=(160.0, 120.0, 0.0))
+    stack, other = still((0, 0, 0), start=(160.0, 120.0, 0.0)), noisy(np.full(FRAME, 90) + 20 * edge(X - 50), RNG)
     counts = {}
     for share in (0.1, 0.5, 1.0):
         searched.clear()
         tracker = Tracker(stack[0], [(160.0, 120.0)], 31, search_share=share)
-        reasons = [int(tracker(torch.full_like(stack[0], 90)).reason) for _ in range(400)]
+        reasons = [int(tracker(other).reason) for _ in range(400)]
         counts[share] = len(searched)
         assert (te.Reason.WAITING in reasons) == (share < 1)
     assert counts[0.1] < counts[0.5] < counts[1.0]
+
+
+def test_a_search_of_the_whole_frame_leaves_some_for_those_near():
+    budget = Budget(torch.tensor(RESERVE / 2), torch.zeros((), dtype=torch.int64), 640 * 480, 31 * 31)
+    assert budget.left()
+    assert not budget.left(RESERVE)
+
+
+def test_a_dark_frame_is_not_searched(monkeypatch):
+    """Nor one that is bright all over; one in which there is anything is."""
+    searched: list[int] = []
+    monkeypatch.setattr(Recovery, "search_near", lambda self, image, estimate, *_: (searched.append(1), estimate)[1])
+    monkeypatch.setattr(Recovery, "search_anywhere", lambda self, images, estimate, past, r: estimate)
+    rng = np.random.default_rng(0)
+    tracker = Tracker(noisy(still((0, 0, 0))[0].numpy(), rng), [(160.0, 120.0), (100.0, 80.0)], 41)
+    for level in (0, 10, 90, 255):
+        estimate = tracker(noisy(np.full(FRAME, level), rng))
+        assert estimate.reason.tolist() == [te.Reason.FLAT] * 2
+        assert not searched
+    tracker(noisy(np.full(FRAME, 90) + 20 * edge(X - 50), rng))
+    assert searched
+
+
+def row_of_parts() -> np.ndarray:
+    """Equal parts 42 px apart."""
+    u = (X - 160 + 21) % 42 - 21
+    return 70 + 100 * edge(12 - abs(u)) * edge(10 - abs(Y - 120)) + 60 * edge(4 - abs(u - 5)) * edge(3 - abs(Y - 124))
+
+
+@pytest.mark.parametrize("velocity", [20.0, -21.0])
+def test_what_was_hidden_is_not_believed_where_a_look_alike_is_expected(velocity):
+    """It has stopped; where it would be by now is another part."""
+    image, rng = row_of_parts(), np.random.default_rng(1)
+    tracker = Tracker(noisy(image, rng), [(160.0, 120.0)], 37)
+    tracker.velocity = torch.tensor([[velocity, 0.0, 0.0]])
+    hidden = np.where(abs(X - 180) < 120, 90, image)
+    assert tracker(noisy(hidden, rng)).status == Status.LOST
+    assert abs(float(tracker.velocity[0, 0])) > 38
+    estimate = tracker(noisy(image, rng))
+    assert estimate.status == Status.CONVERGED
+    assert estimate.displacement[0, :2].abs().max() < 0.2
+
+
+@pytest.mark.parametrize(("off", "lost"), [((3.0, 1.0, 0.0), False), ((50.0, 0.0, 0.0), True), ((0.0, 0.0, 1.5), True)])
+def test_what_was_tracked_far_away_is_doubted(off, lost):
+    """Iterating that ends 50 px from where it began, or turned by a quarter, has met something else."""
+    stack = still((0, 0, 0), (0, 0, 0))
+    tracker = Tracker(stack[0], [(160.0, 120.0)], 61)
+    start, past = tracker.pose.clone(), Past.of(tracker._buffers)
+    estimate = tracker(stack[1])
+    moved = estimate._replace(pose=start + torch.tensor([off]))
+    strays = tracker._recovery.strays(moved, start, past.since)
+    assert not tracker._recovery.strays(estimate, start, past.since)
+    if lost:
+        assert tracker._recovery.not_led_away(moved, strays, start, past).reason.tolist() == [te.Reason.AMBIGUOUS]
+    else:
+        assert not strays
 
 
 @pytest.mark.parametrize("share", [0, 1.5, -1.0, "half", float("nan")])

@@ -218,7 +218,7 @@ def test_copies_hold_no_more_than_the_state() -> None:
     """What follows from the templates is not in a pickle, nor copied: spectra, packed planes, normal equations."""
     tracker = used(backend="native")
     fresh = len(pickle.dumps(made(backend="native")))
-    tracker(BLANK)  # it was searched for, nearby and everywhere
+    tracker(OTHER)  # it was searched for, nearby and everywhere
     assert tracker._recovery.locators
     assert len(pickle.dumps(tracker)) < 1.1 * fresh < 1.1 * (sum(part.nbytes for part in tracker.buffers()) + 20_000)
     twin = copy.deepcopy(tracker)

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_ecc.core.align import solve
+from torch_ecc.core.align import found, solve
 from torch_ecc.core.ambient import lasting, plain
 from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Origin, Status
@@ -26,8 +26,6 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import Sampler, downsample, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, picked
-from torch_ecc.core.solver import iterate
-from torch_ecc.core.step import State
 from torch_ecc.core.verdict import within_margin
 from torch_ecc.search.bank import Bank, search_level
 from torch_ecc.search.matched_filter import whitened_matches
@@ -46,8 +44,7 @@ FILTER_ANGLES = 4  # and their half turns, at which the whitened matched filter 
 FILTER_MATCHES = 4  # of its places, refined at full resolution
 RESTART_DISTANCE = 1.0  # px at the farthest pixel: a refinement that took a pose farther begins anew from there
 MAX_RESTARTS = 3
-COARSE_ITERATIONS = 6
-COARSE_TOLERANCE = 0.1  # px of a coarse level
+COARSE = Settings("bilinear", max_iterations=6, tolerance=0.1, robust=False)  # of alignments in a coarse level, its px
 LEAST_VISIBLE = 0.4  # of a template's weight must lie in the frame
 
 
@@ -228,9 +225,9 @@ def image_pyramid(image: Tensor, levels: int) -> list[Tensor]:
 def aligned(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
     """Candidates (K, 3) of one template aligned with one level: the SURVIVORS of them, best first."""
     copies = _copies(reference, len(pose))
-    state, *_ = iterate(copies, image, "bilinear", State.start(pose), COARSE_TOLERANCE, COARSE_ITERATIONS)
-    before, after = detrended_zncc_at(copies, image, pose), detrended_zncc_at(copies, image, state.pose)
-    pose, score = torch.where((after > before)[:, None], state.pose, pose), torch.maximum(before, after)
+    there = found(copies, image, pose, COARSE).pose
+    before, after = detrended_zncc_at(copies, image, pose), detrended_zncc_at(copies, image, there)
+    pose, score = torch.where((after > before)[:, None], there, pose), torch.maximum(before, after)
     return pose[shortlist(pose, score, radius=reference.place.radius, margin=ALIGNED_MARGIN)[:SURVIVORS]]
 
 

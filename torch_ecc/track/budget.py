@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_ecc.core.sampling import is_cpu
 
 BURST = 3000.0  # frames of credit at most, and at first
+RESERVE = 500.0  # of it that searches of the whole frame leave to those near, which cost a tenth
 LEAST_FRAME = 400_000  # pixels' worth that every frame takes, however small it is: it has to come from somewhere
 SOLVE = 20  # times the pixels of a template: its solve
 CORRELATION = 4  # times the pixels of a spectrum, for every angle
@@ -28,9 +29,9 @@ class Budget:
         if not is_cpu(self.credit.device) or float(self.credit) < BURST:
             self.credit.add_(income)
 
-    def left(self) -> bool:
-        """Whether there is any credit, which is BURST at most."""
-        return float(self.credit.clamp_(max=BURST)) > 0
+    def left(self, reserve: float = 0.0) -> bool:
+        """Whether there is any credit, which is BURST at most, beyond a ``reserve``."""
+        return float(self.credit.clamp_(max=BURST)) > reserve
 
     def spend(self, spectra: int, aligned: int) -> None:
         """On correlations with ``spectra`` values, and what it takes to align what they show, in pixels."""

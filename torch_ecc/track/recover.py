@@ -7,28 +7,33 @@ gone together, that is where the others are looked for.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.align import solve, solve_again
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
+from torch_ecc.core.pyramid import as_images
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import Memory
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
 from torch_ecc.core.verdict import expected_score, just_as_good, noise_share, unknown, within_margin
+from torch_ecc.search.correlation import about_mean
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, REACH, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
-from torch_ecc.track.budget import Budget
+from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.max_step import MaxStep
 
+FLAT_NOISE, FLAT_TEXTURE = 1.5, 0.02  # of the variance of both: a frame that nowhere has more shows no template
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
 AT_ONCE = 4  # templates searched for in the whole of one frame; the others in turn
 KEPT = 2**25  # complex numbers prepared for searches of the whole frame, 256 MB
@@ -144,6 +149,15 @@ def textureless(reference: Reference, settings: Settings) -> tuple[list[bool], l
     return (~(share <= 1)).tolist(), hopeless.tolist()
 
 
+def least_contrast(reference: Reference) -> tuple[int, float]:
+    """A window's side, px, and the variance of grey levels in it that the least of the templates (B,) needs to show at
+    all: more than its noise leaves there."""
+    (image, kept, _), power = as_images(reference), reference.noise.of_frame
+    total = (kept * about_mean(image, kept).square()).sum((1, 2, 3)) / kept.sum((1, 2, 3))
+    least = FLAT_NOISE * power + FLAT_TEXTURE * (total - power).clamp(min=0)
+    return max(min(image.shape[-2:]) // 2, 2), float(least.amin())
+
+
 class Recovery:
     """The searches of one tracker, and what is prepared for them."""
 
@@ -153,6 +167,8 @@ class Recovery:
         self.reference, self.settings, self.max_step = reference, replace(settings, robust=False), max_step
         self.budget = budget
         self.expected = expected_score(reference)
+        self.radii = reference.place.radius.tolist()
+        self.window, self.flattest = least_contrast(reference)
         self.textureless, self.hopeless = textureless(reference, settings)
         self.locators: dict[int, Locator] = {}  # of the templates last searched for
         self.nearby: tuple[list[int], Nearby] | None = None
@@ -168,6 +184,8 @@ class Recovery:
         if not due or not self.budget.left():
             return told(estimate, due, Reason.WAITING)
         images[:] = self.unmarked(images)
+        if self.flat(images[0]):
+            return told(estimate, due, Reason.FLAT)
         start = torch.where((past.since % 2 == 0)[:, None], past.pose, start)  # by turns, as if it had gone on, or not
         found = self.search_near(images[0], estimate, start, past, sorted(due))
         estimate = self.follow(images[0], self.own(found, estimate, start, past), start, past.usual)
@@ -175,7 +193,7 @@ class Recovery:
         kept = plausible(estimate, start, past, self.reference.place.radius).tolist()
         gone = [r for r in due if suspects[r] and not kept[r] and not self.searched_all(past.since[r])]
         for k, r in enumerate(gone):
-            if k == AT_ONCE or not self.budget.left():
+            if k == AT_ONCE or not self.budget.left(RESERVE):
                 estimate = told(estimate, gone[k:], Reason.WAITING)
                 break
             estimate = self.search_anywhere(images, estimate, past, r)
@@ -185,6 +203,12 @@ class Recovery:
         """The ``images`` in float; if the camera has marks, the first one alone, without them."""
         sight, image = self.reference.sight, images[0].float()
         return [image, *images[1:]] if sight is None else [filled(image, sight.shown)]
+
+    def flat(self, image: Tensor) -> bool:
+        """Whether the ``image`` (1 or R, 1, H, W) is nowhere more than noise to any template: a light is out."""
+        about, side = image - image.mean(), min(self.window, *image.shape[-2:])
+        mean, square = (F.avg_pool2d(v, side, max(side // 2, 1)) for v in (about, about * about))
+        return bool((square - mean * mean).amax() <= self.flattest)
 
     def due(self, estimate: Estimate, past: Past) -> list[int]:
         """Which of the suspect templates to search for in this frame: less often those that have a place or too little
@@ -244,24 +268,49 @@ class Recovery:
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
 
+    def strays(self, estimate: Estimate, start: Tensor, since: Tensor) -> list[int]:
+        """Which templates were tracked away from where they were expected, or to where nobody has seen them go: perhaps
+        to a look-alike. It is asked of every frame: of numbers, which cost less than operations."""
+        each = zip(
+            *(value.tolist() for value in (estimate.pose, start, estimate.status, since)), self.radii, strict=True
+        )
+        return [
+            r
+            for r, ((x, y, a), (x0, y0, a0), code, n, radius) in enumerate(each)
+            if code <= Status.MAX_ITERATIONS and (n > 1 or math.hypot(x - x0, y - y0) + radius * abs(a - a0) > BASIN)
+        ]
+
+    def not_led_away(self, estimate: Estimate, strays: list[int], start: Tensor, past: Past) -> Estimate:
+        """The ``estimate`` in which those of the ``strays`` are lost that look-alikes may have led away."""
+        index = torch.tensor(strays, device=start.device)
+        expected = ~strayed(estimate, start, past, self.reference.place.radius, BASIN)[index]
+        doubtful = index[self.doubtful(estimate, index, start, past, expected)]
+        lost = torch.zeros_like(past.since, dtype=torch.bool).index_fill(0, doubtful, True)
+        return disproved(estimate, lost, Reason.AMBIGUOUS)
+
     def own(self, found: Estimate, before: Estimate, start: Tensor, past: Past) -> Estimate:
         """``found`` without the leaps from the ``start`` (R, 3) to where look-alikes of the templates may be as well:
         these are as ``before``."""
         leapt = (found.origin != before.origin).nonzero()[:, 0]
         if len(leapt) == 0:
             return found
-        unseen = [r for r in leapt.tolist() if r not in self.near]
+        doubtful = leapt[self.doubtful(found, leapt, start, past, past.since[leapt] == 1)]
+        return told(found.put(doubtful, before.at(doubtful)), doubtful.tolist(), Reason.AMBIGUOUS)
+
+    def doubtful(self, found: Estimate, index: Tensor, start: Tensor, past: Past, expected: Tensor) -> Tensor:
+        """Of templates at ``index`` (n,) whether the places ``found`` (R, ...) may be those of look-alikes: (n,) bool.
+        These are known around the last place only; farther away are only places that were ``expected`` (n,)."""
+        unseen = [r for r in index.tolist() if r not in self.near]
         if unseen:
             self.near |= zip(unseen, self._look_near(unseen, past), strict=True)
         raised = self.raised(found.score, past.usual)
-        twin = torch.stack([self.near[r].nearest(found.score[r], raised[r]) for r in leapt.tolist()])
-        radius = self.reference.place.radius[leapt]
-        distance, moved = (pose_distance(found.pose[leapt], p[leapt], radius=radius) for p in (start, past.pose))
-        guessed = past.since[leapt] > 1  # where it is expected, which may be far from where it was last
+        twin = torch.stack([self.near[r].nearest(found.score[r], raised[r]) for r in index.tolist()])
+        radius = self.reference.place.radius[index]
+        distance, moved = (pose_distance(found.pose[index], p[index], radius=radius) for p in (start, past.pose))
+        guessed = past.since[index] > 1  # where it is expected, which may be far from where it was last
         distance = torch.where(guessed, torch.maximum(distance, moved), distance)
-        farthest = moved + self.max_step.reach(past.since[leapt], radius)
-        doubtful = leapt[self.confusable(distance, twin, farthest) | (guessed & (moved > KNOWN))]
-        return told(found.put(doubtful, before.at(doubtful)), doubtful.tolist(), Reason.AMBIGUOUS)
+        farthest = moved + self.max_step.reach(past.since[index], radius)
+        return self.confusable(distance, twin, farthest) | (~expected & (moved > KNOWN))
 
     @staticmethod
     def confusable(distance: Tensor, twin: Tensor, farthest: Tensor) -> Tensor:

@@ -306,9 +306,11 @@ class Tracker(nn.Module):
         images = [image.detach()]
         self._recovery.budget.earn(self.income)
         estimate = self._within_reach(self._solve(image, images, start))
+        past = Past.of(state)
+        if self.search and (strays := self._recovery.strays(estimate, start, past.since)):
+            estimate = self._recovery.not_led_away(estimate, strays, start, past)
         doubtful = any(suspect(estimate, state["score"]))
         if doubtful:
-            past = Past.of(state)
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
             estimate = self._within_reach(from_rest(reference, images[0], estimate, past, self.settings))
             if self.search:
