@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_ecc.core.fused import kernel, look
 from torch_ecc.core.fused.records import OF_LOOK, Answers, Frames, Grids, Trusted, Way
-from torch_ecc.core.native import DEGREE
+from torch_ecc.core.native.engine import DEGREE
 from torch_ecc.core.native.entry import How
 from torch_ecc.core.native.packed import Packed
 from torch_ecc.core.reference import BLOCK
