@@ -44,10 +44,10 @@ def scatters(draws: int) -> list[Number]:
         (Plan(), 2.0, draws),
         (Plan(), 5.0, draws),
         (Plan(2048, 8, 61, 1700), 2.0, max(draws // 5, 10)),
-        (Plan(2048, 8, 81, 1700), 2.0, max(draws // 5, 10)),
+        (Plan(2048, 8, 61, 1900), 2.0, max(draws // 5, 10)),
     ):
         found, bound = draw(plan, noise, count), plan.bound(noise)
-        words = f"{plan.side}^2, {plan.across**2} patches of {plan.size} px, noise {noise:g}"
+        words = f"{plan.side}^2, {plan.across**2} patches over {plan.span} px, noise {noise:g}"
         one = float(cramer_rao(SCENE, (121, 121), 2 * (noise**2 + rounding(8)))[2])
         theta, ratio = 1e6 * float(rms(found.error)[2]), rms(found.error) / bound
         told = (f"{theta:.2f}", f"{1e6 * float(bound[2]):.2f}", f"{1e6 * one:.1f}", f"{1e6 * one / theta:.1f}")

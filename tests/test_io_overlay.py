@@ -142,10 +142,21 @@ def test_labels_do_not_cover_each_other_or_leave_the_frame(tmp_path):
     np.testing.assert_allclose(labels, labels[:1].repeat(12, 0), atol=15)
 
 
-def test_a_crowd_gets_numbers_only(tmp_path):
+def test_a_crowd_gets_outlines_and_what_is_wrong_its_number(tmp_path):
+    """Numbers that hide what they number are of no use; of three that are few enough they are there."""
     poses = [(30.0 + 40 * i, 40.0 + 40 * j, 0.0) for i in range(15) for j in range(11)]
-    picture = drawn(tmp_path, GREY, found_at(*poses), shapes=[(31, 31)] * len(poses))
-    assert (picture.max(-1) < 40).mean() < 0.35
+    shapes, record = [(31, 31)] * len(poses), found_at(*poses)
+    whole = drawn(tmp_path / "a", GREY, record, shapes=shapes)
+    status = record.status.clone()
+    status[7] = 2
+    wrong = drawn(tmp_path / "b", GREY, record._replace(status=status), shapes=shapes)
+    few = drawn(tmp_path / "c", GREY, found_at(*poses[:3]), shapes=shapes[:3])
+    dark = [(picture[:60, :160].max(-1) < 40).mean() for picture in (whole, few)]
+    assert (whole.max(-1) < 40).mean() < 0.2
+    assert dark[0] < 0.6 * dark[1]
+    x, y, _ = poses[7]
+    near = np.abs(wrong.astype(int) - whole)[int(y) - 40 : int(y), int(x) - 20 : int(x) + 80]
+    assert (near.max(-1) > 30).mean() > 0.1
 
 
 # ---- frames of any kind --------------------------------------------------------------------------------------------

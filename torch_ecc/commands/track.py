@@ -36,6 +36,7 @@ from torch_ecc.track.tracker import Tracker
 STATUS_NAMES = {int(code): code.name for code in Status}
 REASON_NAMES = {int(code): code.word for code in Reason}
 RESULTS = (*FILES, *BODY_FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
+MANY = 8  # templates that were lost: of more there is one line
 NOT_OF_THE_RESULT = ("out", "force", "resume", "send")
 
 
@@ -55,12 +56,7 @@ class Finished(NamedTuple):
 
     def words(self) -> list[str]:
         """The same in sentences."""
-        said = [
-            f"Template {number} was not found in {lost} of {self.frames} frames. "
-            f"Last frame: {Reason.describe(int(self.last_reason[number]))}"
-            for number, lost in enumerate(self.lost.tolist())
-            if lost
-        ]
+        said = self._losses()
         if self.damaged:
             said.append(f"{self.damaged} of {self.frames} frames are damaged: track.csv says which and why")
         counts = sorted(zip(self.reasons.tolist(), Reason, strict=True), key=lambda each: -each[0])
@@ -71,6 +67,20 @@ class Finished(NamedTuple):
         whole = sorted(path.name for path in self.folder.iterdir() if path.suffix != ".part") if self.frames else []
         end, names = "Stopped after" if self.interrupted else "Tracked", ", ".join(whole) or "nothing"
         return [*said, f"{end} {self.frames} frames. In {self.folder}/: {names}"]
+
+    def _losses(self) -> list[str]:
+        """What is said of templates that were lost: a line of each, or one of all if they are many."""
+        lost = {number: frames for number, frames in enumerate(self.lost.tolist()) if frames}
+        if len(lost) > MANY:
+            worst = sorted(lost, key=lambda number: -lost[number])[:MANY]
+            most = ", ".join(f"{number} in {lost[number]}" for number in worst)
+            of = f"{len(lost)} of {len(self.lost)} templates were not found in some of {self.frames} frames"
+            return [f"{of}, most often {most}: track.csv says why"]
+        return [
+            f"Template {number} was not found in {frames} of {self.frames} frames. "
+            f"Last frame: {Reason.describe(int(self.last_reason[number]))}"
+            for number, frames in lost.items()
+        ]
 
 
 class Session:

@@ -14,6 +14,8 @@ from torch_ecc.io.records import CONVERGED, DOUBTFUL
 _COLOURS: dict[str, Colour] = {CONVERGED: (90, 225, 70), DOUBTFUL: (0, 165, 255)}
 _LOST: Colour = (70, 70, 255)
 _TRAIL: Colour = (255, 215, 90)
+_CROWD = 30  # templates: of more, those that are right are outlines alone,
+_ROOM = 8.0  # unless they are so many times as large as their number
 _Side: TypeAlias = Literal["above", "below", "right", "left", "tag"]
 
 
@@ -51,6 +53,11 @@ class Mark(NamedTuple):
         (x, y), (right, bottom) = points.min(0).astype(int), points.max(0).astype(int)
         return Box(int(x), int(y), int(right - x), int(bottom - y))
 
+    def plain(self, canvas: Canvas, count: int) -> bool:
+        """Whether one of so many templates is to be an outline alone: where nothing is wrong, in a crowd."""
+        box, (w, h) = self.box(canvas), canvas.measure(str(self.number))
+        return count > _CROWD and self.word == CONVERGED and box.w * box.h < _ROOM * w * h
+
     def text(self, side: _Side) -> str:
         """The words of the label: all of them, or only the number (and LOST) for a tag."""
         x, y, theta = self.pose.tolist()
@@ -63,8 +70,11 @@ class Mark(NamedTuple):
         return f"{self.number}   x {x:.2f}   y {y:.2f}{um}\nθ {np.degrees(theta):.3f}°   score {self.score:.3f}"
 
 
-def draw(canvas: Canvas, mark: Mark) -> None:
-    """Everything but the label."""
+def draw(canvas: Canvas, mark: Mark, count: int) -> None:
+    """Everything but the label, of one of so many templates."""
+    if mark.plain(canvas, count):
+        canvas.lines([mark.on_frame(line) for line in mark.outlines], mark.colour, closed=True)
+        return
     if len(mark.trail) > 1:
         canvas.lines([np.stack(tuple(mark.trail))], _TRAIL)
     canvas.lines([mark.on_frame(line) for line in mark.outlines], mark.colour, closed=True, width=1.5)
@@ -84,7 +94,7 @@ class Labels:
     """Where the labels go: beside their templates, clear of each other and of a ``reserved`` part of the canvas.
 
     A label stays on its side while there is room, so that it does not jump about. A template without a free side gets a
-    small tag; in a crowd, where that is so for most of them at first, all do.
+    small tag; where that is so for most of them at first, all do, and in a crowd only those do that are not right.
     """
 
     def __init__(self, reserved: Box) -> None:
@@ -98,6 +108,8 @@ class Labels:
             sides = ["tag"] * len(marks)
         self._sides = sides
         for mark, side in zip(marks, sides, strict=True):
+            if mark.plain(canvas, len(marks)):
+                continue
             text = mark.text(side)
             box, size = mark.box(canvas), canvas.measure(text)
             spot = Box(box.x, box.y - size[1], *size) if side == "tag" else _spots(canvas, box, size)[side]

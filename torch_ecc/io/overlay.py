@@ -115,7 +115,7 @@ class OverlayWriter(FilmWriter):
         footer = Box(0, canvas.image.shape[0] - h, w, h)
         self._labels = self._labels or Labels(footer)
         for mark in marks:
-            draw(canvas, mark)
+            draw(canvas, mark, len(marks))
         self._labels.draw(canvas, marks)
         canvas.label(canvas.clamp(footer), clock, WHITE)
         return canvas.image

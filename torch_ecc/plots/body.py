@@ -66,17 +66,17 @@ def _draw_picture(axes: Axes, image: Tensor, places: Tensor, groups: Sequence[Se
     largest = float(np.nanpercentile(size[used], 90)) if bool(used.any()) else 0.0
     factor = _round(LONGEST * float(np.hypot(*gray.shape)) / largest) if largest > 0 else 1.0
     for g, group in enumerate(groups):
-        for r in group:
-            mark = "o" if used[r] else "x"
-            axes.plot(*at[r], mark, ms=5, color=_colour(g), mfc="none")
-            if np.isfinite(residual[r]).all():
-                arrow = {"width": 1.5, "headwidth": 5, "headlength": 5, "color": _colour(g), "shrink": 0}
-                axes.annotate(
-                    "", at[r] + factor * residual[r], at[r], arrowprops=arrow, annotation_clip=False, clip_on=True
-                )
+        mine = np.zeros(len(at), bool)
+        mine[list(group)] = True
+        for mark, some in (("o", mine & used), ("x", mine & ~used)):
+            axes.plot(*at[some].T, mark, ms=4 if mark == "o" else 6, color=_colour(g), mfc="none")
+        # Of those that do not agree the arrows may be as long as the picture is wide, and say nothing.
+        to = factor * residual[mine & used]
+        whole: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.0022, "headwidth": 4.5}
+        axes.quiver(*at[mine & used].T, *to.T, color=_colour(g), minshaft=1.5, minlength=0.5, zorder=3, **whole)
     rms = float(np.sqrt(np.nanmean(np.square(size[used])) / 2)) if bool(used.any()) else np.nan
-    words = f"residuals where each body is farthest away, {factor:,.0f} times enlarged; rms {rms:.4f} px"
-    axes.set_title(f"{words}\no: agrees, x: does not, or was not found there")
+    words = f"Residuals where each body is farthest from its start, {factor:,.0f} times enlarged; rms {rms:.4f} px"
+    axes.set_title(f"{words}\n{int(used.sum())} patches agree (o); x: does not, or was not found there", fontsize=10)
     axes.set(xlim=(-0.5, gray.shape[1] - 0.5), ylim=(gray.shape[0] - 0.5, -0.5), xticks=[], yticks=[])
     axes.grid(visible=False)
 
