@@ -29,7 +29,8 @@ SOURCES, LIBRARIES = HERE / "csrc", HERE / "libraries"
 SECONDS = 600  # a compiler that takes longer is given up
 CONSTANTS = {  # of the Python modules, for the C++
     "packed": ["MOST", "PLANES", "NUMBERS", "MOMENTS"],
-    "reference": ["BLOCK", "LEVELS"],
+    "columns": ["LEVELS"],
+    "reference": ["BLOCK"],
     "sampling": ["ROUNDING"],
     "solution": ["CLUSTERS", "FLAT", "SUMS"],
     "solver": ["COARSE_TOLERANCE"],

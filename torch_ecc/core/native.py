@@ -67,7 +67,8 @@ def _counted(reference: Reference, moments: Tensor, trust: Trust | None) -> Norm
     columns = reference.K.shape[1]
     number, *matrices, gram, noise = moments[index].split((1, MOST**2, MOST**2, 16, 8), 1)
     normal, power = (matrix.view(-1, MOST, MOST)[:, :columns, :columns] for matrix in matrices)
-    anew = normal_equations(Moments(number[:, 0], normal, power, gram.view(-1, 4, 4), noise.view(-1, 2, 4)))
+    sums = Moments(number[:, 0], normal, power, gram.view(-1, 4, 4), noise.view(-1, 2, 4))
+    anew = normal_equations(sums, reference.noise.response[index if trust is None else trust.which[index]])
     if trust is not None or len(index) == len(reference.K):  # with trust all of them are
         return anew
     return each(lambda old, new: old.index_copy(0, index, new), reference.normal, anew)
