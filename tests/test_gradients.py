@@ -9,7 +9,7 @@ from test_readme import BLOCKS
 from torch import Tensor, nn
 
 import torch_ecc as te
-from torch_ecc.core import reference as prepared
+from torch_ecc.core import columns as prepared
 from torch_ecc.core import solver
 from torch_ecc.core.align import found, solve
 from torch_ecc.core.reference import Reference, prepare

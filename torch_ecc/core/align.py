@@ -12,9 +12,10 @@ from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
 from torch_ecc.core.native import engine as native
+from torch_ecc.core.pushed import left_of_push
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solution import Solution
+from torch_ecc.core.solution import Engine
 from torch_ecc.core.verdict import judge
 
 
@@ -81,20 +82,20 @@ def solve_again(
 ) -> tuple[Estimate, Tensor | None]:
     """The same with a ``memory`` of the frames before; and the trust (B, blocks) to be remembered, None if it is
     whole."""
+    engine = engine_for(reference, image, settings)
+    # What is left of a push would make half as much again of a graph.
+    left = None if torch.compiler.is_compiling() else partial(left_of_push, engine, reference, image, settings)
     if not implicit.wanted(reference, image, pose):
-        there = found(reference, image, pose, settings, memory)
-        return judge(reference, there, pose, settings, origin), there.trust
+        there = robust.solve(engine, reference, image, pose, settings, memory)
+        return judge(reference, there, pose, settings, origin, left), there.trust
     with torch.no_grad():
-        there = found(reference, image.detach(), pose.detach(), settings, memory)
+        there = robust.solve(engine, reference, image.detach(), pose.detach(), settings, memory)
     attached = implicit.attached(reference, image, pose, there, settings)
-    return judge(reference, attached, pose, settings, origin), there.trust
+    return judge(reference, attached, pose, settings, origin, left), there.trust
 
 
-def found(
-    reference: Reference, image: Tensor, pose: Tensor, settings: Settings, memory: robust.Memory | None = None
-) -> Solution:
-    """What the engine for these B templates finds."""
+def engine_for(reference: Reference, image: Tensor, settings: Settings) -> Engine:
+    """The one that solves this, and sees what the camera shows."""
     fit = (engine.solve for engine in (native, fused) if engine.takes(reference, image, settings))
     engine = next(fit, solver.solve)
-    seeing = engine if reference.sight is None else partial(sight.solve, engine)
-    return robust.solve(seeing, reference, image, pose, settings, memory)
+    return engine if reference.sight is None else partial(sight.solve, engine)

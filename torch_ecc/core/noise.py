@@ -9,19 +9,26 @@ from torch import Tensor
 
 from torch_ecc.core.criteria import centred
 from torch_ecc.core.pose import pose_dtype
-from torch_ecc.core.sampling import blur, noise_level
+from torch_ecc.core.sampling import blur, gradients, noise_level, pad
 
 INSTRUMENT_BLUR = 0.9  # px; 0.7 to 1 serve alike
+DIM_BLURS = (2.0, 4.0)  # px, of templates in which texture is told from noise where it is coarse alone
+NOISE_SHARE = 0.6  # of the information in any direction may be noise: else that, not texture, fixes the pose
 NEARBY = 4.0  # px: Gaussian window in which the texture of a template is told from its noise
 CERTAIN = 1.3  # times the noise's power in that window: by chance alone it is not more
-# Of the x derivative of white noise of unit variance: raw times blurred by INSTRUMENT_BLUR, and blurred squared.
-NOISE_RESPONSE = (0.176801398, 0.055585362)
+# Of the x derivative of white noise of unit variance, by the blur: raw times blurred, and blurred squared.
+NOISE_RESPONSE = {
+    INSTRUMENT_BLUR: (0.176801398, 0.055585362),
+    2.0: (0.009822021, 0.002479801),
+    4.0: (0.000621317, 0.000155421),
+}
 LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
 
 
 class Noise(NamedTuple):
-    """Of B templates: ``level`` (B,), upper estimate of their noise, grey levels, ``power`` (B,), its square, and how
-    many ``frames`` (B,) each is the mean of; ``alias``, of each sampler whose own error counts: (B, 3, 2), by how far
+    """Of B templates: ``level`` (B,), upper estimate of their noise, grey levels, ``power`` (B,), its square, how many
+    ``frames`` (B,) each is the mean of, and what their instruments make of it, the ``response`` (B, 2), one of
+    ``NOISE_RESPONSE``; ``alias``, of each sampler whose own error counts: (B, 3, 2), by how far
     aliasing along the template's x and y shifts the pose, rms over the phase. Where a template lies is uncertain by a
     ``place_share`` (B,) of what one frame's noise makes of a pose, and by a covariance ``place`` (B, 3, 3) in its axes,
     None if that is nothing."""
@@ -29,16 +36,17 @@ class Noise(NamedTuple):
     level: Tensor
     power: Tensor
     frames: Tensor
+    response: Tensor
     alias: dict[str, Tensor]
     place_share: Tensor
     place: Tensor | None = None
 
     @staticmethod
-    def of(level: Tensor) -> Noise:
+    def of(level: Tensor, instrument_blur: float = INSTRUMENT_BLUR) -> Noise:
         """Of templates cut from one frame."""
         power = level.to(pose_dtype(level.device)).square()
-        one = torch.ones_like(power)
-        return Noise(level, power, one, {}, one.clone())
+        one, response = torch.ones_like(power), power.new_tensor(NOISE_RESPONSE[instrument_blur])
+        return Noise(level, power, one, response.repeat(len(power), 1), {}, one.clone())
 
     @property
     def of_frame(self) -> Tensor:
@@ -54,15 +62,30 @@ def template_noise(gray: Tensor, kept: Tensor, known: Tensor | None = None) -> T
     return torch.maximum(noise_level(gray, kept) if known is None else known.to(contrast), LEAST_NOISE * contrast)
 
 
+def blurred(image: Tensor, margin: int, noise: Tensor, instrument_blur: float) -> tuple[Tensor, Tensor, Tensor]:
+    """An ``image`` (B, 1, h, w) blurred, its gradient (B, 2, h, w), and how much of that is texture, not ``noise``:
+    (B, 1, h, w). What it was continued by, the ``margin`` px, has the same noise twice and more.
+
+    A wide blur leaves so little noise that no place need be left out for it, but would bring in that of the margin.
+    """
+    if instrument_blur == INSTRUMENT_BLUR:
+        soft = blur(image, instrument_blur)
+        slopes = gradients(soft)
+        return soft, slopes, wiener_weight(slopes, noise)
+    soft = pad(blur(image[:, :, margin:-margin, margin:-margin], instrument_blur), margin)
+    return soft, gradients(soft), torch.ones_like(soft)
+
+
 def wiener_weight(gradient: Tensor, noise: Tensor) -> Tensor:
-    """How much of the blurred ``gradient`` (B, 2, h, w) is texture, not ``noise`` (B,), near each pixel: (B, 1, h, w).
+    """How much of the ``gradient`` (B, 2, h, w), blurred by INSTRUMENT_BLUR, is texture, not ``noise`` (B,), near each
+    pixel: (B, 1, h, w).
 
     The factor S / (S + N / 2) that makes the scatter of two equally noisy images least, from the gradient's power
     nearby. Where a template is flat its gradient is all noise, which as an instrument would only add scatter. The noise
     may vary from pixel to pixel, (B, 1, h, w).
     """
     noise = noise.view(-1, 1, 1, 1) if noise.dim() == 1 else noise
-    floor = 2 * NOISE_RESPONSE[1] * noise.to(gradient.dtype).square()
+    floor = 2 * NOISE_RESPONSE[INSTRUMENT_BLUR][1] * noise.to(gradient.dtype).square()
     power = (blur(gradient.square().sum(1, keepdim=True), NEARBY) - CERTAIN * floor).clamp(min=0)
     return power / (power + floor / 2).clamp(min=1e-30)
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.criteria import inverse_where, safe_inverse
-from torch_ecc.core.noise import NOISE_RESPONSE, errors_in_variables, largest_eigenvalue
+from torch_ecc.core.noise import errors_in_variables, largest_eigenvalue
 
 LEAST = 1e-30  # what is divided by is at least so much
 
@@ -49,8 +49,8 @@ class Normal(NamedTuple):
     gram: Tensor
 
 
-def normal_equations(sums: Moments) -> Normal:
-    """What follows from the sums over the pixels that count.
+def normal_equations(sums: Moments, response: Tensor) -> Normal:
+    """What follows from the sums over the pixels that count; ``response`` (B, 2): see ``noise.Noise``.
 
     The first rows k of the inverse are those of K by Z W, so that k P k^T is what white noise makes of an increment;
     their first block is the inverse of the bread, the Schur complement of the other columns.
@@ -58,9 +58,10 @@ def normal_equations(sums: Moments) -> Normal:
     inverse, regular = safe_inverse(sums.normal)
     rows, block = inverse[:, :3], inverse[:, :3, :3]
     spread = rows @ sums.power @ rows.mT
+    even = (block + block.mT) / 2  # as it is but for noise, which alone may have complex eigenvalues
     bread = torch.where(regular[:, None, None], inverse_where(regular, block), 0.0)
-    biases = errors_in_variables(sums.noise.flatten(0, 1)).view(-1, 2, 3, 3).unbind(1)
-    bread_bias, meat_bias = (bias * response for bias, response in zip(biases, NOISE_RESPONSE, strict=True))
+    biases = errors_in_variables(sums.noise.flatten(0, 1)).view(-1, 2, 3, 3)
+    bread_bias, meat_bias = (biases * response[:, :, None, None]).unbind(1)
     total, along, count = sums.gram[:, 0, 0], sums.gram[:, 0, 3], sums.number.clamp(min=1)
     energy = (sums.gram[:, 3, 3] - along * along / total.clamp(min=LEAST)).clamp(min=0)
     return Normal(
@@ -70,7 +71,7 @@ def normal_equations(sums: Moments) -> Normal:
         meat=bread @ spread @ bread.mT,
         bread_bias=bread_bias,
         meat_bias=meat_bias,
-        noise_share=torch.where(regular, largest_eigenvalue(block @ bread_bias), torch.inf),
+        noise_share=torch.where(regular, largest_eigenvalue(even @ bread_bias), torch.inf),
         white=spread.diagonal(dim1=1, dim2=2).clamp(min=LEAST),
         total=total,
         freedom=(total * (count - inverse.shape[-1]).clamp(min=1) / count).clamp(min=LEAST),

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -26,12 +26,13 @@ from torch import Tensor
 
 from torch_ecc.core.ambient import lasting, ordinary
 from torch_ecc.core.blocks import Blocks, Parts, blocks_of, parts_of
+from torch_ecc.core.columns import Columns, columns_of
 from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
-from torch_ecc.core.noise import INSTRUMENT_BLUR, Noise, template_noise, wiener_weight
+from torch_ecc.core.noise import DIM_BLURS, INSTRUMENT_BLUR, NOISE_SHARE, Noise, blurred, template_noise
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.pose import pose_dtype, rotation
-from torch_ecc.core.sampling import SAMPLERS, aliasing, blur, gradients, pad
+from torch_ecc.core.sampling import SAMPLERS, aliasing, gradients, pad
 
 if TYPE_CHECKING:
     from torch_ecc.core.native.packed import Packed
@@ -40,10 +41,11 @@ if TYPE_CHECKING:
 MARGIN = 8  # px that a template is continued by before it is differentiated and blurred
 ENOUGH = 1500  # pixels of a template tell well where to go; the first iterations leave out others in x and y
 SPARSEST = 4  # px between those that are kept
+FAINT = 0.25  # px: by so much noise may move the farthest pixel in an iteration of them
 BLOCK = 6  # px: side of the blocks over which the last look at a patch is summed
 PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which takes some 600 bytes on the way
+NARROW = 8  # times the blur of its instruments: no template is as narrow
 SMALLEST = 5  # px: side of the smallest template
-LEVELS = 2**15 - 1  # a template is rounded to so many steps on either side: an engine may hold it in 16 bits
 
 Fields = TypeVar("Fields", bound=tuple[object, ...])
 
@@ -72,19 +74,6 @@ class Place(NamedTuple):
     lever: Tensor
     lever2: Tensor
     unit: Tensor
-
-
-class Columns(NamedTuple):
-    """Per pixel: ``signal`` and ``instrument`` (B, 4, N) = [G, t], raw and blurred, the blurred G times ``wiener``
-    (B, N), see ``noise.wiener_weight``; ``weight`` (B, N). The slopes and t of the instrument and of the signal count
-    in ``unit`` (B, 4) grey levels (per px), and t from ``level`` (B, 2): whole numbers of at most ``LEVELS``."""
-
-    signal: Tensor
-    instrument: Tensor
-    wiener: Tensor
-    weight: Tensor
-    unit: Tensor
-    level: Tensor
 
 
 class Sight(NamedTuple):
@@ -208,6 +197,11 @@ def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared
     return make(*values)
 
 
+def chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Of B templates the ``new`` values (B, ...) where they are ``better`` (B,)."""
+    return torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old)
+
+
 @ordinary
 def prepare(
     template: Tensor,
@@ -225,7 +219,7 @@ def prepare(
     levels (default: estimated, where fine texture counts as noise). Templates and masks may require grad. Raises
     ValueError for bad shapes, dtypes, NaN, unknown options and for templates of one single grey level.
     """
-    chosen = make_criterion(criterion, illumination)
+    criterion = make_criterion(criterion, illumination)
     gray = as_gray("prepare", "template", template)
     size = (gray.shape[-2], gray.shape[-1])
     if min(size) < SMALLEST:
@@ -239,7 +233,8 @@ def prepare(
     noise = template_noise(gray.detach(), kept.detach(), noise)
     some, used = max(PIXELS_AT_ONCE // gray[0].numel(), 1), (kept > 0).any(0).flatten()
     given = (value.split(some) for value in (gray, kept.expand(len(gray), -1, -1, -1), centre, noise))
-    return _joined((_prepared(chosen, part, used) for part in zip(*given, strict=True)), len(gray))
+    whole = _joined((_prepared(criterion, part, used) for part in zip(*given, strict=True)), len(gray))
+    return whole._replace(coarse=_coarser(whole))
 
 
 def _joined(parts: Iterator[Reference], count: int) -> Reference:
@@ -266,28 +261,40 @@ def _refuse_flat(gray: Tensor, kept: Tensor) -> None:
 def _prepared(criterion: Criterion, given: Sequence[Tensor], used: Tensor) -> Reference:
     """``prepare`` of what is ``given``, grey templates (B, 1, h, w) with weights (B, 1, h, w), ``centre`` (B, 2) and
     noise (B,), of which the pixels ``used`` (h w,) count in any template."""
+    gray, reference = given[0], _instrumented(criterion, given, used, INSTRUMENT_BLUR)
+    for wider in (blur for blur in DIM_BLURS if NARROW * blur < min(gray.shape[2:])):
+        share = reference.normal.noise_share * reference.noise.power
+        if bool((share <= NOISE_SHARE).all()):
+            break
+        other = _instrumented(criterion, given, used, wider)
+        better = (share > NOISE_SHARE) & (other.normal.noise_share * other.noise.power < share)
+        reference = each(partial(chosen, better), other, reference)
+    return reference
+
+
+def _instrumented(criterion: Criterion, given: Sequence[Tensor], used: Tensor, instrument_blur: float) -> Reference:
+    """The same with instruments of some blur, without a coarser one."""
     gray, kept, centre, noise = given
 
     def counted(images: Tensor) -> Tensor:  # (B, k, h, w) to (B, k, N)
         return images[:, :, MARGIN:-MARGIN, MARGIN:-MARGIN].flatten(2)[:, :, used]
 
     grid, wide = _grid(used, gray), pad(gray, MARGIN)
-    soft = blur(wide, INSTRUMENT_BLUR)
-    slopes = gradients(soft)
-    wiener = counted(wiener_weight(slopes, noise))
+    soft, slopes, wiener = blurred(wide, MARGIN, noise, instrument_blur)
+    wiener = counted(wiener)
     weight = kept.flatten(1)[:, used]
     place = _place(grid, centre, weight)
     images = (
         torch.cat((counted(slopes) * wiener, counted(soft)), 1),
         torch.cat((counted(gradients(wide)), counted(wide)), 1),
     )
-    columns = _columns(grid.pixels[:2] - centre[:, :, None], images, wiener[:, 0], weight)
-    reference = _solved(criterion, grid, place, columns, Noise.of(noise))
+    columns = columns_of(grid.pixels[:2] - centre[:, :, None], images, wiener[:, 0], weight)
+    reference = _solved(criterion, grid, place, columns, Noise.of(noise, instrument_blur))
     for name, kernel in SAMPLERS.items():
         if kernel.aliases:
             shift = reference.K[:, :3] @ counted(aliasing(wide, name)).mT
             reference.noise.alias[name] = shift.to(place.radius.dtype) / 2**0.5
-    return reference._replace(coarse=_coarser(reference))
+    return reference
 
 
 def _grid(used: Tensor, image: Tensor) -> Grid:
@@ -313,33 +320,10 @@ def _place(grid: Grid, centre: Tensor, weight: Tensor) -> Place:
     return Place(centre, radius, lever, lever.square(), torch.cat((one, -centre[:, :, None]), -1) / half)
 
 
-def _columns(local: Tensor, images: tuple[Tensor, Tensor], wiener: Tensor, weight: Tensor) -> Columns:
-    """Rounded columns from ``images`` [d/dx, d/dy, t] (B, 3, N), blurred and raw, at ``local`` (B, 2, N) about the
-    centre."""
-    columns, units, levels = [], [], []
-    for image in images:
-        level = image[:, 2:].mean(-1, keepdim=True)
-        parts = image[:, :2], image[:, 2:] - level
-        unit = [part.detach().abs().amax((1, 2), keepdim=True).clamp(min=1e-30) / LEVELS for part in parts]
-        # Exactly unit * round(part / unit), with the gradient of the part.
-        slopes, t = (p + (u * (p / u).round() - p).detach() for p, u in zip(parts, unit, strict=True))
-        columns.append(_steepest_descent(torch.cat((slopes, t + level), 1), local))
-        units += unit
-        levels.append(level)
-    instrument, signal = columns
-    return Columns(signal, instrument, wiener, weight, torch.cat(units, 1)[..., 0], torch.cat(levels, 1)[..., 0])
-
-
-def _steepest_descent(image: Tensor, local: Tensor) -> Tensor:
-    """[G, t] (B, 4, N) from [d/dx, d/dy, t] (B, 3, N): eq. (8) at theta = 0 gives dW/dtheta = (y', -x')."""
-    gx, gy, t = image.unbind(1)
-    return torch.stack((gx, gy, gx * local[:, 1] - gy * local[:, 0], t), 1)
-
-
 def _coarser(reference: Reference) -> Reference | None:
     """The pixels on a grid coarser by a whole number, as many as tell well where to go; None if that is all of them."""
     grid, columns = reference.grid, reference.columns
-    step = min(max(math.isqrt(grid.pixels.shape[1] // ENOUGH), 1), SPARSEST)
+    step = min(max(math.isqrt(grid.pixels.shape[1] // ENOUGH), 1), _sparsest(reference))
     if step == 1:
         return None
     column, row = (grid.pixels[:2] - grid.box[:2, :1]).long()
@@ -350,16 +334,24 @@ def _coarser(reference: Reference) -> Reference | None:
     return _solved(reference.criterion, grid, reference.place, columns, reference.noise)
 
 
+def _sparsest(reference: Reference) -> int:
+    """Px between pixels of which so few still tell where to go: noise moves the farthest one by as many times more."""
+    shift = (2 * reference.noise.power * (reference.normal.white * reference.place.lever2).sum(1)).sqrt()
+    most = float(torch.where(shift <= FAINT, shift, 0.0).max())  # what is not found with all pixels does not count
+    return SPARSEST if most * SPARSEST <= FAINT else int(FAINT / most)
+
+
 def _solved(criterion: Criterion, grid: Grid, place: Place, columns: Columns, noise: Noise) -> Reference:
     """A reference with its normal equations."""
-    K, normal = _normal_equations(criterion, grid, place, columns)
+    K, normal = _normal_equations(criterion, grid, place, columns, noise.response)
     return Reference(criterion, grid, place, columns, K, normal, noise, None)
 
 
 def reweigh(reference: Reference, counted: Tensor) -> Reference:
     """The reference whose pixels count as ``counted`` (B, N), 0 to 1 or bool: new weight, K and normal equations."""
     columns = reference.columns._replace(weight=reference.columns.weight * counted)
-    K, normal = _normal_equations(reference.criterion, reference.grid, reference.place, columns)
+    criterion, grid, place = reference.criterion, reference.grid, reference.place
+    K, normal = _normal_equations(criterion, grid, place, columns, reference.noise.response)
     return reference._replace(columns=columns, K=K, normal=normal)
 
 
@@ -374,8 +366,10 @@ def restrict(reference: Reference, counted: Tensor) -> Reference:
     return reference._replace(columns=columns, K=(inverse @ reference.normal.matrix).to(KV.dtype) @ KV)
 
 
-def _normal_equations(criterion: Criterion, grid: Grid, place: Place, columns: Columns) -> tuple[Tensor, Normal]:
-    """K (B, p, N) and the normal equations under the columns' weights."""
+def _normal_equations(
+    criterion: Criterion, grid: Grid, place: Place, columns: Columns, response: Tensor
+) -> tuple[Tensor, Normal]:
+    """K (B, p, N) and the normal equations under the columns' weights; ``response`` (B, 2): see ``Noise``."""
     weight, dtype, uv = columns.weight[:, None], place.radius.dtype, place.unit @ grid.pixels
     R, Z = (criterion.columns(v, uv) for v in (columns.signal, columns.instrument))
     ZW, t = Z * weight, columns.signal[:, 3:]
@@ -390,5 +384,5 @@ def _normal_equations(criterion: Criterion, grid: Grid, place: Place, columns: C
         (shape * weight) @ shape.mT,
         (torch.cat((q, q * q), 1) @ arms.mT).to(dtype),
     )
-    normal = normal_equations(sums)
+    normal = normal_equations(sums, response)
     return (normal.inverse @ ZW.to(dtype)).to(R.dtype), normal

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple, cast
 
 import torch
@@ -16,17 +17,20 @@ from torch import Tensor
 
 from torch_ecc.core.ambient import plain, threads_for
 from torch_ecc.core.frame import as_gray, require_tensor
-from torch_ecc.core.noise import INSTRUMENT_BLUR, LEAST_NOISE, Noise, wiener_weight
-from torch_ecc.core.normal import Moments, normal_equations
+from torch_ecc.core.noise import DIM_BLURS, INSTRUMENT_BLUR, LEAST_NOISE, NOISE_SHARE, Noise, blurred
+from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.patches import QUANTISATION, Size, as_size
-from torch_ecc.core.reference import MARGIN, Grid, Place, Reference
-from torch_ecc.core.sampling import blur, clipped, gradients, noise_samples, pad
+from torch_ecc.core.reference import MARGIN, Grid, Place, Reference, chosen, each
+from torch_ecc.core.sampling import clipped, gradients, noise_samples, pad
 from torch_ecc.core.verdict import predicted_sigma
 
 MOST_PLACES = 16_000  # of a map
 FINENESS = 10  # steps per side of a window
 LEVELS = 128  # of noise that are told apart, from squares of
 SQUARE = 12  # px
+BLURRED = 3  # images that instruments are made of, before all others
+
+Products = dict[tuple[int, int], Tensor]  # of two images, their sums
 
 
 class TextureMap(NamedTuple):
@@ -75,14 +79,16 @@ class _Windows(NamedTuple):
         both = _power_sums(along_x.permute(2, 1, 0), self.size[0], self.step)  # (columns, i, j, rows)
         return both.permute(3, 0, 1, 2).flatten(0, 1)
 
-    def gram(self, images: Tensor) -> Tensor:
-        """Sums over each window of all products of ``images`` (n, H, W), each times 1, x and y: (windows, 3 n, 3 n)."""
+    def gram(self, images: Tensor, known: Products) -> Tensor:
+        """Sums over each window of all products of ``images`` (n, H, W), each times 1, x and y: (windows, 3 n, 3 n);
+        those that are ``known`` are not made again."""
         power = torch.tensor([[0, 0], [1, 0], [0, 1]])  # of x and y
         i, j = (power[:, None] + power).unbind(-1)
-        n, blocks = len(images), dict[tuple[int, int], Tensor]()
+        n, blocks = len(images), dict(known)
         for a in range(n):
-            for b in range(a, n):
+            for b in (b for b in range(a, n) if (a, b) not in known):
                 blocks[a, b] = blocks[b, a] = self.sums(images[a] * images[b])[:, i, j]  # as symmetric as the product
+        known |= {pair: block for pair, block in blocks.items() if min(pair) >= BLURRED}
         return torch.cat([torch.cat([blocks[a, b] for b in range(n)], 2) for a in range(n)], 1)
 
 
@@ -122,23 +128,40 @@ def _predicted(gray: Tensor, windows: _Windows, rounding: float) -> Tensor:
     """Sigma (windows, 3) of a frame (1, 1, H, W), as ``texture`` has it, from each window's normal equations."""
     wide = pad(gray - gray.mean(), 2 * MARGIN)
     level = torch.maximum(_noise(gray, windows), LEAST_NOISE * _contrast(_inner(wide)[0, 0], windows))
-    normal = normal_equations(_moments(wide, level, windows))
+    known: Products = {}
+    noise, normal = _observed(wide, level, windows, INSTRUMENT_BLUR, known)
+    for wider in DIM_BLURS:
+        share = normal.noise_share * noise.power
+        if bool((share <= NOISE_SHARE).all()):
+            break
+        others = _observed(wide, level, windows, wider, known)
+        better = (share > NOISE_SHARE) & (others[1].noise_share * noise.power < share)
+        noise = each(partial(chosen, better), others[0], noise)
+        normal = each(partial(chosen, better), others[1], normal)
     none, (h, w) = torch.zeros_like(level), windows.size
     lever2 = torch.stack((none + 1, none + 1, none + ((h - 1) ** 2 + (w - 1) ** 2) / 4), 1)
     grid = Grid(torch.empty(3, h * w), torch.empty(3, 4), torch.empty(2), torch.empty(0), (0, 0), 0)
     place = Place(torch.empty(0), torch.empty(0), lever2.sqrt(), lever2, torch.empty(0))
-    reference = cast(Reference, _Judged(Noise.of(level), grid, place))
+    reference = cast(Reference, _Judged(noise, grid, place))
     variance = level.square() + rounding
     return predicted_sigma(reference, normal, variance)
 
 
-def _moments(wide: Tensor, noise: Tensor, windows: _Windows) -> Moments:
-    """Of each window, with its ``noise`` (windows,), in a frame (1, 1, ...) that is continued on every side."""
-    soft = blur(wide, INSTRUMENT_BLUR)
-    slopes, one = gradients(soft), torch.ones_like(_inner(wide))
-    q = _inner(wiener_weight(slopes, _everywhere(noise, windows, wide.shape)))
+def _observed(
+    wide: Tensor, level: Tensor, windows: _Windows, instrument_blur: float, known: Products
+) -> tuple[Noise, Normal]:
+    """Noise and normal equations of each window under instruments of some blur, see ``_moments``."""
+    noise = Noise.of(level, instrument_blur)
+    return noise, normal_equations(_moments(wide, level, windows, instrument_blur, known), noise.response)
+
+
+def _moments(wide: Tensor, noise: Tensor, windows: _Windows, instrument_blur: float, known: Products) -> Moments:
+    """Of each window, with its ``noise`` (windows,), in a frame (1, 1, ...) that is continued on every side; products
+    of images that are not blurred are ``known`` afterwards."""
+    soft, slopes, texture = blurred(wide, 2 * MARGIN, _everywhere(noise, windows, wide.shape), instrument_blur)
+    q, one = _inner(texture), torch.ones_like(_inner(wide))
     images = _inner(slopes) * q, _inner(soft), _inner(gradients(wide)), _inner(wide), one
-    gram = windows.gram(torch.cat(images, 1)[0])
+    gram = windows.gram(torch.cat(images, 1)[0], known)
     number = gram[:, 18, 18]
     Z, R = (_columns(k, windows.size, gram[:, 3 * k + 6, 18] / number) for k in (0, 3))
     arms = [windows.sums(each)[:, [0, 1, 0, 2, 0], [0, 0, 1, 0, 2]] for each in (q[0, 0], q[0, 0].square())]

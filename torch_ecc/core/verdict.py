@@ -5,7 +5,7 @@ It is made for every frame, of few numbers: what can be known before is, and on 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import NamedTuple, TypeVar
 
@@ -15,11 +15,12 @@ from torch import Tensor
 from torch_ecc.core.ambient import constant, lasting
 from torch_ecc.core.clinging import clinging, scale_of
 from torch_ecc.core.covariance import Sandwich, coherence, largest_variance, pose_covariance, sandwich
-from torch_ecc.core.criteria import safe_inverse
+from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Reason, Status
+from torch_ecc.core.noise import NOISE_SHARE
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.pose import turn
-from torch_ecc.core.reference import Grid, Reference
+from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution
@@ -28,8 +29,7 @@ LEAST_COVERAGE = 0.5  # of the weight in sight must be believed: else what cover
 LEAST_INFORMATION = 0.2  # of that of all pixels in sight must be left in what is believed, in x, y and theta each
 AMBIGUITY_MARGIN = (1.5, 0.01)  # (a, b): a score s is as good as the best if 1 - s <= a (1 - s_best) + b
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
-NOISE_SHARE = 0.6  # of the information in some direction is the template's noise: not even a good match helps, but
-CHANCE = 42.0  # over the square root of the number of pixels: noise as such is within so much of all of it
+LEAST_SHARE = 0.2  # of the information, if it is white: with less, noise of no spectrum fixes a pose
 DOUBTFUL_SHARE = 0.8  # of the noise that there may be, as the likely reason why a template was not found
 LEAST_CONTRAST = 0.1  # of the template's: what has less is flat, and so is what has no more than
 BARE_NOISE = 2.0  # times the template's noise
@@ -54,7 +54,7 @@ class Known(NamedTuple):
     """What the verdict on B templates needs, the same in every frame: ``free`` and ``template_free`` (B,), the degrees
     of freedom of what a residual's square sum is made of, frame and template; ``per_frame`` (B,), one over how many
     frames a template is the mean of; ``clusters`` (B, 9), see ``clinging.scale_of``, None if there are too few blocks;
-    ``share`` (B,), see ``unit_share``; ``sandwich``, see there."""
+    ``share`` (B,), ``noise_share`` of a variance of 1; ``sandwich``, see there."""
 
     free: Tensor
     template_free: Tensor
@@ -72,7 +72,7 @@ def known_of(reference: Reference, normal: Normal, interpolation: str) -> Known:
         per_frame * normal.freedom,
         per_frame,
         scale_of(reference.grid, normal),
-        unit_share(reference.grid, normal),
+        normal.noise_share / NOISE_SHARE,
         sandwich(noise, normal, interpolation),
     )
 
@@ -88,10 +88,15 @@ def known(reference: Reference, normal: Normal, interpolation: str) -> Known:
 
 
 def judge(
-    reference: Reference, found: Solution, start: Tensor, settings: Settings, origin: Tensor | None = None
+    reference: Reference,
+    found: Solution,
+    start: Tensor,
+    settings: Settings,
+    origin: Tensor | None = None,
+    left: Callable[[Solution], Tensor] | None = None,
 ) -> Estimate:
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back. ``displacement`` counts from
-    ``origin`` (B, 3), by default the start."""
+    ``origin`` (B, 3), by default the start. ``left``: what is of a push, see there."""
     normal, total, pose, axes = found.normal, found.total, found.pose, turn(found.pose.select(1, 2))
     constant = known(reference, normal, settings.interpolation)
     power, error, score = found.gain.square(), total.select(1, 6), correlation(normal, total)
@@ -105,14 +110,14 @@ def judge(
     covariance = pose_covariance(constant.sandwich, variance, power, bias, scatter, coherent)
     unobservable = largest_variance(reference.place.lever2, covariance), constant.share * bias
     visible, believed = seen_and_believed(reference, found)
-    amounts = visible, score, found.gain, believed, *unobservable, found.error
+    amounts = visible, score, found.gain, believed, *unobservable, found.error, normal.noise_share * variance
     if strained is not None:  # which is no lack of texture
         covariance = covariance + strained
     covariance = torch.bmm(torch.bmm(axes, covariance), axes.mT)
     tracked, status, reason = (codes.clone() for codes in _zeros(len(pose), pose.device))
     rms = (error / normal.total).sqrt()
     if not (is_cpu(pose.device) and beyond_doubt(amounts, settings)):
-        status, reason = verdict(reference, found, amounts, settings)
+        status, reason = verdict(reference, found, amounts, settings, left)
         good = Status.good(status)
         unfitted = ~good & ~normal.noise_share.isfinite()  # singular: all that is in sight of the patch is left
         rms = torch.where(unfitted, (total[:, 2] / normal.total.clamp(min=LEAST)).sqrt(), rms)
@@ -129,16 +134,32 @@ def beyond_doubt(amounts: Sequence[Tensor], settings: Settings) -> bool:
 
 
 def verdict(
-    reference: Reference, found: Solution, amounts: Sequence[Tensor], settings: Settings
+    reference: Reference,
+    found: Solution,
+    amounts: Sequence[Tensor],
+    settings: Settings,
+    left: Callable[[Solution], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Status and reason codes (B,) int8 from the ``amounts``, (B,) each, that ``VERDICTS`` are about, of which the
-    second is the score: light that varies must not make a stranger of the template."""
-    visible, score, *others = amounts
+    second is the score: light that varies and noise must not make a stranger of the template. The last one is the share
+    of the information that noise is if it is white. Where that may be noise of another kind, and all else is well,
+    noise is what is ``left`` of a push."""
+    visible, score, *others, noise, error, share = amounts
     match = torch.maximum(score, detrended(found.normal, found.total))
-    sign, limit = _limit_tensors(settings, match.dtype, match.device)
-    passed = (torch.stack((visible, match, *others), 1) * sign >= limit).to(torch.int8)  # NaN passes nothing
-    first = torch.nn.functional.pad(passed, (0, 1)).argmin(1)
+    match = torch.maximum(match, without_noise(reference, found, score))
+    first = failed(torch.stack((visible, match, *others, noise, error), 1), settings)
+    doubtful = (share > LEAST_SHARE) & Status.good(_codes(0, first.device).index_select(0, first))
+    if left is not None and not (is_cpu(first.device) and not bool(doubtful.any())):
+        noise = torch.maximum(noise, torch.where(doubtful, left(found) / DOUBTFUL_SHARE, 0.0))
+        first = failed(torch.stack((visible, match, *others, noise, error), 1), settings)
     return explained(reference, found, first, match, settings.min_score)
+
+
+def failed(amounts: Tensor, settings: Settings) -> Tensor:
+    """Which of the tests of ``VERDICTS`` the ``amounts`` (B, 7) are the first to fail, (B,): the last one is none."""
+    sign, limit = _limit_tensors(settings, amounts.dtype, amounts.device)
+    passed = (amounts * sign >= limit).to(torch.int8)  # NaN passes nothing
+    return torch.nn.functional.pad(passed, (0, 1)).argmin(1)
 
 
 def explained(
@@ -167,14 +188,14 @@ def without_contrast(reference: Reference, found: Solution) -> Tensor:
 def _limits(settings: Settings) -> list[tuple[int, float]]:
     """Which way each amount counts, and how much it has to be at least."""
     least = settings.min_visible, settings.min_score, torch.finfo(torch.float32).tiny, LEAST_COVERAGE
-    most = LARGEST_SIGMA**2, 1.0, settings.tolerance
+    most = LARGEST_SIGMA**2, 1.0, settings.tolerance, LEAST_SHARE
     return [*((1, value) for value in least), *((-1, -value) for value in most)]
 
 
 @constant
 def _limit_tensors(settings: Settings, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The same, (7,) each."""
-    sign, limit = zip(*_limits(settings), strict=True)
+    """The same of those that ``VERDICTS`` are about, (7,) each."""
+    sign, limit = zip(*_limits(settings)[:7], strict=True)
     return torch.tensor(sign, dtype=dtype, device=device), torch.tensor(limit, dtype=dtype, device=device)
 
 
@@ -232,18 +253,23 @@ def detrended(normal: Normal, total: Tensor) -> Tensor:
     return torch.where(solid, tg * (tt * gg).clamp(min=torch.finfo(tg.dtype).tiny).rsqrt(), 0.0).clamp(-1, 1)
 
 
+def without_noise(reference: Reference, found: Solution, score: Tensor) -> Tensor:
+    """What the ``score`` (B,) would be without noise that hides a dim template: over what the template's noise lets
+    expect, and no more than the correlation of the blocks' means, in which noise is next to nothing."""
+    sums = found.sums if found.trust is None else found.sums * found.trust[:, None]
+    weight, some = sums[:, 0], reference.blocks.weight.clamp(min=LEAST)
+    g, t = sums[:, 1] / found.sums[:, 0].clamp(min=LEAST), reference.blocks.t / some
+    (g, norm), (t, contrast) = centred(g, weight), centred(t, weight)
+    coarse = (g * t * weight).sum(1) / (norm * contrast).clamp(min=LEAST)
+    return torch.minimum(score / expected_score(reference).clamp(min=LEAST), coarse)
+
+
 def noise_share(reference: Reference, normal: Normal, variance: Tensor | None = None) -> Tensor:
     """The largest part (B,) of the information in any direction that the template's noise can be, whose variance is at
-    most ``variance`` (B,), over what it may be: the more pixels there are, the better noise is told from texture.
-    Infinite or NaN where the texture leaves a direction open."""
+    most ``variance`` (B,), over what it may be. Infinite or NaN where the texture leaves a direction open."""
     power, frames = reference.noise.power, reference.noise.frames
     power = power if variance is None else torch.minimum(power, variance / frames)
-    return unit_share(reference.grid, normal) * power
-
-
-def unit_share(grid: Grid, normal: Normal) -> Tensor:
-    """The same (B,) for a noise of variance 1."""
-    return normal.noise_share.div(max(NOISE_SHARE, 1 - CHANCE / grid.pixels.shape[1] ** 0.5))
+    return normal.noise_share / NOISE_SHARE * power
 
 
 def predicted_sigma(reference: Reference, normal: Normal, variance: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torch_ecc.core.align import found, solve
+from torch_ecc.core.align import engine_for, solve
 from torch_ecc.core.ambient import lasting, plain
 from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Origin, Status
@@ -225,7 +225,7 @@ def image_pyramid(image: Tensor, levels: int) -> list[Tensor]:
 def aligned(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
     """Candidates (K, 3) of one template aligned with one level: the SURVIVORS of them, best first."""
     copies = _copies(reference, len(pose))
-    there = found(copies, image, pose, COARSE).pose
+    there = engine_for(copies, image, COARSE)(copies, image, pose, COARSE, None).pose
     before, after = detrended_zncc_at(copies, image, pose), detrended_zncc_at(copies, image, there)
     pose, score = torch.where((after > before)[:, None], there, pose), torch.maximum(before, after)
     return pose[shortlist(pose, score, radius=reference.place.radius, margin=ALIGNED_MARGIN)[:SURVIVORS]]

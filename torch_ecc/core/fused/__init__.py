@@ -75,7 +75,8 @@ def _counted(reference: Reference, moments: Tensor, trust: Trust | None) -> Norm
     """The normal equations with those of the partial templates made anew from ``moments`` (n, ...); the host does not
     ask which they are."""
     partial = moments[:, 0] >= 0
-    anew = normal_equations(moments_of(moments, reference.K.shape[1]))
+    response = reference.noise.response if trust is None else reference.noise.response[trust.which]
+    anew = normal_equations(moments_of(moments, reference.K.shape[1]), response)
     if trust is not None:  # with it all of them are
         return anew
     return each(

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import triton.language as tl
 
 from torch_ecc.core import sampling, solution, solver, step
+from torch_ecc.core.columns import LEVELS
 from torch_ecc.core.native.packed import MOMENTS, MOST, NUMBERS
 from torch_ecc.core.normal import LEAST
-from torch_ecc.core.reference import BLOCK, LEVELS
+from torch_ecc.core.reference import BLOCK
 
 SIDE, PLACES = tl.constexpr(BLOCK), tl.constexpr(MOST)
 SUMS, CLUSTERS = tl.constexpr(solution.SUMS), tl.constexpr(solution.CLUSTERS)

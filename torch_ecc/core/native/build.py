@@ -31,7 +31,8 @@ SOURCES, LIBRARIES, CORE = HERE / "csrc", HERE / "libraries", HERE.parent
 SECONDS = 600  # a compiler that takes longer is given up
 CONSTANTS = {  # of the Python modules, for the C++
     "native.packed": ["MOST", "PLANES", "NUMBERS", "MOMENTS"],
-    "reference": ["BLOCK", "LEVELS"],
+    "columns": ["LEVELS"],
+    "reference": ["BLOCK"],
     "sampling": ["ROUNDING"],
     "solution": ["CLUSTERS", "FLAT", "SUMS"],
     "solver": ["COARSE_TOLERANCE"],

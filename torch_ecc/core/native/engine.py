@@ -64,7 +64,8 @@ def _counted(reference: Reference, moments: Tensor, trust: Trust | None) -> Norm
     """The normal equations with those of the partial templates made anew from ``moments`` (n, ...); with ``trust`` of
     those that it is about."""
     index = (moments[:, 0] >= 0).nonzero()[:, 0]
-    anew = normal_equations(moments_of(moments[index], reference.K.shape[1]))
+    response = reference.noise.response[index if trust is None else trust.which[index]]
+    anew = normal_equations(moments_of(moments[index], reference.K.shape[1]), response)
     if trust is not None or len(index) == len(reference.K):  # with trust all of them are
         return anew
     return each(lambda old, new: old.index_copy(0, index, new), reference.normal, anew)
