@@ -321,5 +321,5 @@ def test_what_would_be_read_beyond_its_end_is_refused(image, start, trust):
 
 
 def test_unknown_backend():
-    with pytest.raises(ValueError, match=r"backend: expected one of \['auto', 'torch', 'native'\], got 'gpu'"):
+    with pytest.raises(ValueError, match=r"backend: expected one of \['auto', 'torch', 'native', 'fused'\], got 'gpu'"):
         Settings(backend="gpu")
