@@ -77,16 +77,15 @@ def solve_again(
     settings: Settings,
     origin: Tensor | None = None,
     memory: robust.Memory | None = None,
-) -> tuple[Estimate, Tensor | None]:
-    """The same with a ``memory`` of the frames before; and the trust (B, blocks) to be remembered, None if it is
-    whole."""
+) -> tuple[Estimate, Solution]:
+    """The same with a ``memory`` of the frames before; and what it is judged from."""
     if not implicit.wanted(reference, image, pose):
         there = found(reference, image, pose, settings, memory)
-        return judge(reference, there, pose, settings, origin), there.trust
+        return judge(reference, there, pose, settings, origin), there
     with torch.no_grad():
         there = found(reference, image.detach(), pose.detach(), settings, memory)
     attached = implicit.attached(reference, image, pose, there, settings)
-    return judge(reference, attached, pose, settings, origin), there.trust
+    return judge(reference, attached, pose, settings, origin), there
 
 
 def found(

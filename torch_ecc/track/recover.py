@@ -7,6 +7,7 @@ gone together, that is where the others are looked for.
 
 from __future__ import annotations
 
+import warnings
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -156,6 +157,14 @@ def least_contrast(reference: Reference) -> tuple[int, float]:
     total = (kept * about_mean(image, kept).square()).sum((1, 2, 3)) / kept.sum((1, 2, 3))
     least = FLAT_NOISE * power + FLAT_TEXTURE * (total - power).clamp(min=0)
     return max(min(image.shape[-2:]) // 2, 2), float(least.amin())
+
+
+def warn_of_textureless(each: list[bool]) -> None:
+    """Says which templates will be LOW_TEXTURE in most frames, where the tracker is made."""
+    which = [r for r, textureless in enumerate(each) if textureless]
+    if which:
+        names = f"template {which[0]}" if len(which) == 1 else f"templates {', '.join(map(str, which))}"
+        warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=7)
 
 
 class Recovery:
