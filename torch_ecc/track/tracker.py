@@ -29,10 +29,11 @@ from torch_ecc.track.coarse import coarse_to_fine
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told
 from torch_ecc.track.max_step import MaxStep
-from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect, warn_of_textureless
+from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
 from torch_ecc.track.sensor import dead_in, kept, shown
 from torch_ecc.track.shutter import Shutter
 from torch_ecc.track.still import Watch, without_marks
+from torch_ecc.track.textureless import warn_of_textureless
 
 DERIVED = ("references", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
 
