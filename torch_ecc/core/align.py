@@ -12,7 +12,7 @@ from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
 from torch_ecc.core.native import engine as native
-from torch_ecc.core.pushed import left_of_push
+from torch_ecc.core.pushed import MOST_LEFT, left_of_push
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution
@@ -108,5 +108,5 @@ def engine_for(reference: Reference, image: Tensor, settings: Settings) -> Engin
 
 
 def pushed(reference: Reference, image: Tensor, settings: Settings, there: Solution) -> Tensor:
-    """What is left (B,) of a push, see ``left_of_push``."""
-    return left_of_push(engine_for(reference, image, settings), reference, image, settings, there)
+    """What is left (B,) of a push, over what may be, see ``left_of_push``."""
+    return left_of_push(engine_for(reference, image, settings), reference, image, settings, there) / MOST_LEFT
