@@ -12,7 +12,7 @@ from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
 from torch_ecc.core.native import engine as native
-from torch_ecc.core.pushed import left_of_push
+from torch_ecc.core.pushed import MOST_LEFT, left_of_push
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution
@@ -81,16 +81,22 @@ def solve_again(
     memory: robust.Memory | None = None,
 ) -> tuple[Estimate, Solution]:
     """The same with a ``memory`` of the frames before; and what it is judged from."""
-    engine = engine_for(reference, image, settings)
     # What is left of a push would make half as much again of a graph.
-    left = None if torch.compiler.is_compiling() else partial(left_of_push, engine, reference, image, settings)
+    left = None if torch.compiler.is_compiling() else partial(pushed, reference, image, settings)
     if not implicit.wanted(reference, image, pose):
-        there = robust.solve(engine, reference, image, pose, settings, memory)
+        there = found(reference, image, pose, settings, memory)
         return judge(reference, there, pose, settings, origin, left), there
     with torch.no_grad():
-        there = robust.solve(engine, reference, image.detach(), pose.detach(), settings, memory)
+        there = found(reference, image.detach(), pose.detach(), settings, memory)
     attached = implicit.attached(reference, image, pose, there, settings)
     return judge(reference, attached, pose, settings, origin, left), there
+
+
+def found(
+    reference: Reference, image: Tensor, pose: Tensor, settings: Settings, memory: robust.Memory | None = None
+) -> Solution:
+    """What the engine for these B templates finds."""
+    return robust.solve(engine_for(reference, image, settings), reference, image, pose, settings, memory)
 
 
 def engine_for(reference: Reference, image: Tensor, settings: Settings) -> Engine:
@@ -98,3 +104,8 @@ def engine_for(reference: Reference, image: Tensor, settings: Settings) -> Engin
     fit = (engine.solve for engine in (native, fused) if engine.takes(reference, image, settings))
     engine = next(fit, solver.solve)
     return engine if reference.sight is None else partial(sight.solve, engine)
+
+
+def pushed(reference: Reference, image: Tensor, settings: Settings, there: Solution) -> Tensor:
+    """What is left (B,) of a push, over what may be, see ``left_of_push``."""
+    return left_of_push(engine_for(reference, image, settings), reference, image, settings, there) / MOST_LEFT

@@ -18,29 +18,42 @@ from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust
 
 PUSH = 0.5  # px, of the farthest pixel
+LEAST_ANSWER = 0.1  # where no direction answers more, nothing holds the pose
+MOST_LEFT = 0.7  # of a push: more is noise's
 
 
 @torch.no_grad()
 def left_of_push(engine: Engine, reference: Reference, image: Tensor, settings: Settings, found: Solution) -> Tensor:
     """The share (B,) of a push that one iteration of the ``engine`` leaves of templates that were ``found``, in the
-    direction in which their texture is most like noise: of texture next to none, of noise all of it."""
+    direction in which their texture is most like noise: of texture next to none, of noise all of it. Of a blurred
+    picture it leaves something in every direction: what counts is how much more in that one than in any."""
     image, found = image.detach(), found._replace(pose=found.pose.detach())
-    axes, direction = turn(found.pose[:, 2]), likest_to_noise(found.normal)
+    least, most = by_information(found.normal)
+    weak, strong = (answer(engine, reference, image, settings, found, way) for way in (least, most))
+    return 1 - weak / strong.clamp(LEAST_ANSWER, 1.0)
+
+
+def answer(
+    engine: Engine, reference: Reference, image: Tensor, settings: Settings, found: Solution, direction: Tensor
+) -> Tensor:
+    """The share (B,) of a push in a ``direction`` (B, 3) that is taken back."""
+    axes = turn(found.pose[:, 2])
     push = direction * (PUSH / torch.linalg.vector_norm(direction * reference.place.lever, dim=1, keepdim=True))
     starts = (retract(found.pose, away) for away in (push, -push))
     before, after = (engine(reference, image, start, settings.once, trusted(found)).pose for start in starts)
     apart = (axes.mT @ (after - before)[:, :, None])[:, :, 0]
     power = found.normal.bread_bias.diagonal(dim1=1, dim2=2)
     share: Tensor = (apart * power * push).sum(1) / (2 * (push * power * push).sum(1)).clamp(min=LEAST)
-    return share
+    return 1 - share
 
 
-def likest_to_noise(normal: Normal) -> Tensor:
-    """The increment (B, 3), of some length, about which there is least information for what noise would leave."""
+def by_information(normal: Normal) -> tuple[Tensor, Tensor]:
+    """The increments (B, 3), of some length, about which there is least and most information for what noise would
+    leave."""
     unit = normal.bread_bias.diagonal(dim1=1, dim2=2).clamp(min=LEAST).rsqrt()
     information = normal.bread * unit[:, :, None] * unit[:, None]
     directions: Tensor = torch.linalg.eigh(information.nan_to_num(0.0, 0.0, 0.0))[1]
-    return directions[:, :, 0] * unit
+    return directions[:, :, 0] * unit, directions[:, :, 2] * unit
 
 
 def trusted(found: Solution) -> Trust | None:

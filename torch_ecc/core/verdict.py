@@ -96,7 +96,7 @@ def judge(
     left: Callable[[Solution], Tensor] | None = None,
 ) -> Estimate:
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back. ``displacement`` counts from
-    ``origin`` (B, 3), by default the start. ``left``: what is of a push, see there."""
+    ``origin`` (B, 3), by default the start. ``left``: what is of a push, over what may be."""
     normal, total, pose, axes = found.normal, found.total, found.pose, turn(found.pose.select(1, 2))
     constant = known(reference, normal, settings.interpolation)
     power, error, score = found.gain.square(), total.select(1, 6), correlation(normal, total)
@@ -150,7 +150,7 @@ def verdict(
     first = failed(torch.stack((visible, match, *others, noise, error), 1), settings)
     doubtful = (share > LEAST_SHARE) & Status.good(_codes(0, first.device).index_select(0, first))
     if left is not None and not (is_cpu(first.device) and not bool(doubtful.any())):
-        noise = torch.maximum(noise, torch.where(doubtful, left(found) / DOUBTFUL_SHARE, 0.0))
+        noise = torch.maximum(noise, torch.where(doubtful, left(found), 0.0))
         first = failed(torch.stack((visible, match, *others, noise, error), 1), settings)
     return explained(reference, found, first, match, settings.min_score)
 
