@@ -15,6 +15,7 @@ import math
 import os
 import shutil
 import time
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice, pairwise
@@ -154,7 +155,7 @@ def _append(session: Session, piece: Path, own: range, watch: Watch) -> Seam:
     if part is None:
         raise ValueError(f"batch: the part in {piece} holds no frames")
     records = part.records(piece)
-    begin = int(np.searchsorted(records["frame"], own[0]))
+    begin = bisect_left(records["frame"], own[0])  # without reading all of them
     if joined is None:
         _copy(session, (piece, part), begin, np.zeros(part.form.templates, np.int64))
         return Seam(own[0], 0.0, 0.0, tracked_through=False)

@@ -17,7 +17,7 @@ from torch_ecc.io.output import append, create
 from torch_ecc.io.records import CONVERGED, DAMAGED, DOUBTFUL, ReasonNames, StatusNames
 
 _CODES = 128  # that an int8 has for a status or a reason
-_VALUES = 1 << 20  # of all templates: medians over more are taken of frames some apart
+_VALUES = 1 << 17  # of all templates: medians over more are taken of frames some apart
 _NEVER = -1
 
 
