@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import kornia
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torch_ecc.core import sampling as S
+from torch_ecc.core.frame import as_gray
 
 BOX = torch.tensor([[-10.0, 10.0, 10.0, -10.0], [-8.0, -8.0, 8.0, 8.0], [1.0, 1.0, 1.0, 1.0]])
 INTERPOLATIONS = ["bilinear", "bspline3", "bspline5"]
@@ -148,3 +150,17 @@ def test_templates_share_one_image_without_copies():
     sampler = S.make_sampler("bilinear", image, warp_at(30, 30).expand(7, 2, 3), BOX)
     assert sampler.values.data_ptr() == image.data_ptr()
     assert sampler(warp_at(30, 30).expand(7, 2, 3), pixels()).shape == (7, 50)
+
+
+@pytest.mark.parametrize(("sigma", "shape"), [(0.7, (2, 1, 40, 33)), (1.0, (1, 1, 300, 400)), (3.0, (1, 1, 64, 30))])
+def test_blur_is_a_gaussian_mirrored_at_the_border(sigma, shape):
+    """As another library has it."""
+    image = 255 * torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    size = 2 * int(4 * sigma + 0.5) + 1
+    theirs = kornia.filters.gaussian_blur2d(image, (size, size), (sigma, sigma), border_type="reflect")
+    torch.testing.assert_close(S.blur(image, sigma), theirs, rtol=0, atol=2e-4)
+
+
+def test_colours_become_grey_as_another_library_has_it():
+    image = 255 * torch.rand(2, 3, 20, 30, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(as_gray("test", "image", image), kornia.color.rgb_to_grayscale(image), rtol=0, atol=1e-4)

@@ -10,6 +10,7 @@ from torch_ecc.core.pose import pose_dtype
 KEPT = (torch.uint8, torch.uint16)  # as they are, if they are grey
 EXACT = (torch.bool, torch.int8, torch.int16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 WIDE = (torch.int32, torch.int64, torch.uint32, torch.uint64)  # may hold more than a float32 does
+LUMA = (0.299, 0.587, 0.114)  # of red, green and blue, by ITU-R 601
 PIXEL_DTYPES = KEPT + EXACT + WIDE
 
 
@@ -66,9 +67,8 @@ def as_image(where: str, name: str, image: object, device: torch.device | str | 
         _require_values(where, name, image, gray)
     if gray.shape[1] == 1:
         return gray
-    from kornia.color import rgb_to_grayscale  # kornia takes longer to import than all the rest of this package
-
-    return rgb_to_grayscale(gray[:, :3])
+    r, g, b = (gray[:, k : k + 1] * share for k, share in enumerate(LUMA))
+    return r + g + b
 
 
 def _require_values(where: str, name: str, image: Tensor, gray: Tensor) -> None:

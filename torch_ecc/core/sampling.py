@@ -1,6 +1,6 @@
 """Image values between pixels: B-spline and bilinear sampling, gradients, blur and pyramid.
 
-The one place that knows the coordinates of ``grid_sample`` and of kornia. Everywhere else a point is (x, y) in px with
+The one place that knows the coordinates of ``grid_sample``. Everywhere else a point is (x, y) in px with
 pixel centres at integers, and a warp is a 2x3 matrix that takes homogeneous template pixels (3, N) to such points.
 """
 
@@ -331,12 +331,18 @@ def pad(image: Tensor, margin: int) -> Tensor:
 
 
 def blur(image: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of (B, 1, H, W)."""
-    size = 2 * int(4 * sigma + 0.5) + 1
-    sigmas = torch.tensor([[sigma, sigma]], dtype=image.dtype, device="cpu")  # of numbers it takes the default device
-    from kornia.filters import gaussian_blur2d  # slow to import
-
-    return gaussian_blur2d(image, (size, size), sigmas, border_type="reflect")
+    """Gaussian blur of (B, 1, H, W), mirrored at its border; as kornia's, which takes a tenth of a second to import."""
+    radius = int(4 * sigma + 0.5)
+    x = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
+    weights = torch.softmax(-x * x / (2 * sigma**2), 0)
+    image = F.pad(image, (radius, radius, radius, radius), mode="reflect")
+    for dim in (3, 2):  # tap by tap: a convolution first copies the image once for every tap
+        n = image.shape[dim] - 2 * radius
+        total = image.narrow(dim, 0, n) * weights[0]
+        for k in range(1, len(weights)):
+            total.addcmul_(image.narrow(dim, k, n), weights[k])
+        image = total
+    return image
 
 
 def downsample(image: Tensor) -> Tensor:

@@ -5,24 +5,43 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from itertools import islice
+from typing import TypeVar
 
 T = TypeVar("T")
 
-_AHEAD, _BEHIND = 4, 16  # frames in memory at most
+_AHEAD, _BEHIND = 4, 16  # frames in memory at most: of the first, twice so many
 
 
 def ahead(items: Iterable[T]) -> Iterator[T]:
-    """The same ``items``, a few of them made before they are asked for; what making one raises is raised here."""
-    end, source = object(), iter(items)
+    """The same ``items``, a few of them made before they are asked for; what making one raises is raised here.
+
+    Several at once: two threads that meet at every frame take a tenth more of a busy processor's time.
+    """
+    source = iter(items)
     with ThreadPoolExecutor(1, "ahead") as thread:
-        waiting: deque[Future[Any]] = deque(thread.submit(next, source, end) for _ in range(_AHEAD))
+        waiting = deque(thread.submit(_some, source) for _ in range(2))
         try:
-            while (item := waiting.popleft().result()) is not end:
-                waiting.append(thread.submit(next, source, end))
-                yield item
+            while True:
+                made, error = waiting.popleft().result()
+                waiting.append(thread.submit(_some, source))
+                yield from made
+                if error is not None:
+                    raise error
+                if len(made) < _AHEAD:
+                    return
         finally:
             thread.shutdown(cancel_futures=True)
+
+
+def _some(source: Iterator[T]) -> tuple[list[T], Exception | None]:
+    """The next few items, or all that come before an error, with that."""
+    made = list[T]()
+    try:
+        made.extend(islice(source, _AHEAD))
+    except Exception as error:
+        return made, error
+    return made, None
 
 
 class Behind:

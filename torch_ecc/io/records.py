@@ -68,9 +68,9 @@ def to_arrays(record: Record) -> dict[str, NDArray[Any]]:
     arrays = {}
     for name, (dtype, tail) in FIELDS.items():
         value: Tensor = getattr(record, name)
-        if tuple(value.shape) != (count, *tail):
+        if value.shape != (count, *tail):
             raise ValueError(f"write: record.{name} must be {(count, *tail)}, got {tuple(value.shape)}")
-        arrays[name] = (value if value.device.type == "cpu" else value.cpu()).detach().numpy().astype(dtype)
+        arrays[name] = value.numpy(force=True).astype(dtype)
     return arrays
 
 

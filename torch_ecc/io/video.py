@@ -132,12 +132,16 @@ def _decoded(container: Any, stream: Any) -> Iterator[tuple[float | None, _Decod
 def _raw(number: int, frame: _Decoded, time_s: float | None) -> Raw:
     if isinstance(frame, str):
         return Raw(number, frame, time_s)
-    turns = frame.rotation // 90
     gray = _luma(frame)
     if gray is None:
-        return Raw(number, np.rot90(_rgb(frame), turns), time_s)
-    colours = (lambda: np.rot90(_shown(frame), turns)) if len(frame.format.components) > 1 else None
-    return Raw(number, np.rot90(gray, turns), time_s, colours=colours)
+        return Raw(number, _upright(_rgb(frame), frame), time_s)
+    colours = (lambda: _upright(_shown(frame), frame)) if len(frame.format.components) > 1 else None
+    return Raw(number, _upright(gray, frame), time_s, colours=colours)
+
+
+def _upright(pixels: Pixels, frame: av.VideoFrame) -> Pixels:
+    """Turned as the file wants it shown."""
+    return np.rot90(pixels, frame.rotation // 90) if frame.rotation else pixels
 
 
 def _luma(frame: av.VideoFrame) -> Pixels | None:

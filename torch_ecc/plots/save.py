@@ -13,8 +13,10 @@ def save(figure: Figure, path: Path, dpi: int) -> Path:
     part = path.with_name(f"{path.name}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
     part.unlink(missing_ok=True)  # a link that bears its name is not followed
+    form = path.suffix.lstrip(".") or "png"
+    quick = {"pil_kwargs": {"compress_level": 3}} if form == "png" else {}
     try:
-        figure.savefig(part, dpi=dpi, format=path.suffix.lstrip(".") or "png")
+        figure.savefig(part, dpi=dpi, format=form, **quick)
     except OSError:
         part.unlink(missing_ok=True)
         raise

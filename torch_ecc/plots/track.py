@@ -26,6 +26,20 @@ _MOSAIC = "xa;yb;tc;sr;wr"  # x, y, theta beside their sigma a, b, c; score and 
 _WIDTH, _TOP, _BOTTOM = 12.5, 0.8, 0.85  # inches: of all, and of what is above and below the curves
 
 
+_RC: Any = {  # told beforehand: what is changed of axes that exist already is made twice
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.formatter.useoffset": False,
+    "axes.xmargin": 0.01,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "xtick.labelsize": 9.5,
+    "ytick.labelsize": 9.5,
+}
+
+
+@mpl.rc_context(_RC)
 def plot_track(
     track: str | Path | Mapping[str, ArrayLike], path: str | Path, *, title: str = "", dpi: int = 130
 ) -> Path:
@@ -54,10 +68,11 @@ def plot_track(
     _draw_motion(axes, data, colours)
     _draw_quality(axes, data, colours)
     _draw_status(axes["w"], data)
-    for axis in axes.values():
-        _dress(axis)
+    axes["x"].locator_params(axis="x", nbins=6)  # shared by all
     for name, axis in axes.items():
         axis.yaxis.set_label_coords(-0.085 if name in _MOSAIC[::3] else -0.17, 0.5)
+        if name != "w":
+            axis.locator_params(axis="y", nbins=5)
     for name in "wr":
         axes[name].set_xlabel(data.time_label)
     _annotate(figure, data, colours, title)
@@ -114,6 +129,7 @@ def _draw_status(axis: Axes, data: Drawn) -> None:
     place: Any = {"extent": (*data.span, templates - 0.5, -0.5), "aspect": "auto", "interpolation": "nearest"}
     axis.imshow(data.status.T, cmap=shades, vmin=-0.5, vmax=len(data.words) - 0.5, **place)
     axis.set_yticks(range(0, templates, max(1, -(-templates // 8))))
+    axis.grid(False)
     axis.set_ylabel("status")
 
 
@@ -129,17 +145,6 @@ def _curve(axis: Axes, data: Drawn, sides: list[NDArray[np.float64]], colour: An
         time, values = np.repeat(time, 2), np.stack(sides, -1).ravel()
     # A point between two gaps makes no line: short tracks show their frames as dots, too.
     axis.plot(time, values, color=colour, lw=1.1, marker="." if len(time) <= 120 else None, ms=4)
-
-
-def _dress(axis: Axes) -> None:
-    strip = bool(axis.images)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=9.5)
-    axis.margins(x=0.01)
-    if not strip:
-        axis.grid(color="#dddddd", lw=0.6)
-        axis.ticklabel_format(axis="y", useOffset=False)
-        axis.locator_params(axis="y", nbins=5)
 
 
 def _annotate(figure: Figure, data: Drawn, colours: list[Any], title: str) -> None:
