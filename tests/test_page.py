@@ -162,7 +162,7 @@ def test_a_grid_the_best_places_and_imagej(clockwork):
     assert max(x for x, _, _ in best) < np.median([x for x, _, _ in found])
     page.wait_for_selector("#legend:visible")
     page.uncheck("#map")
-    page.click("text=Paste an outline")
+    page.click("text=An outline from ImageJ")
     page.fill("#paste textarea", "makeRectangle(260, 180, 121, 121)")
     page.click("text=Add it")
     clockwork.sigma(6)
@@ -170,6 +170,62 @@ def test_a_grid_the_best_places_and_imagej(clockwork):
     page.fill("#paste textarea", "what is this")
     page.click("text=Add it")
     page.wait_for_selector("#error:has-text('expected a line')")
+    clockwork.clear()
+
+
+def test_files_of_imagej_and_undo(clockwork, tmp_path):
+    """Chosen or dropped; what was marked is taken back and made again."""
+    roifile = pytest.importorskip("roifile", reason="pip install 'torch-ecc[view]'")
+    page, desk, path = clockwork.page, clockwork.desk, tmp_path / "one.roi"
+    roifile.ImagejRoi(roitype=roifile.ROI_TYPE.RECT, left=260, top=180, right=381, bottom=301).tofile(path)
+    box = {"x": 320, "y": 240, "w": 121, "h": 121}
+    page.set_input_files("#roi", path)
+    clockwork.sigma()
+    assert desk.marks == [box]
+    dropped = page.evaluate_handle(
+        "bytes => { const all = new DataTransfer();"
+        " all.items.add(new File([new Uint8Array(bytes)], 'two.roi')); return all; }",
+        list(path.read_bytes()),
+    )
+    page.dispatch_event("#canvas", "drop", {"dataTransfer": dropped})
+    clockwork.sigma(2)
+    page.keyboard.press("Control+z")
+    clockwork.sigma(1)
+    page.click("#undo")
+    page.wait_for_selector("#patches .empty:visible")
+    page.keyboard.press("Control+Shift+z")
+    clockwork.sigma(1)
+    assert desk.marks == [box]
+    path.write_bytes(b"no region")
+    page.set_input_files("#roi", path)
+    page.wait_for_selector("#error:has-text('one.roi is no region')")
+    clockwork.clear()
+
+
+def test_two_fingers_zoom(clockwork):
+    """To twice the size, and across: a rectangle that is then drawn is half as large, where the fingers have led."""
+    page, session = clockwork.page, clockwork.context.new_cdp_session(clockwork.page)
+    (x, y), (right, _) = clockwork.at(320, 240), clockwork.at(420, 240)
+    scale = (right - x) / 100
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        dots = [{"x": px, "y": py, "id": number} for number, (px, py) in enumerate(points)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": dots})
+
+    touch("touchStart", (x - 40, y))
+    touch("touchStart", (x - 40, y), (x + 40, y))
+    touch("touchMove", (x - 60, y), (x + 60, y))
+    touch("touchMove", (x - 80 + 50, y + 20), (x + 80 + 50, y + 20))
+    touch("touchEnd")
+    assert clockwork.desk.marks == []  # no finger has marked anything
+    page.mouse.move(x + 50 - 60 * scale, y + 20 - 60 * scale)
+    page.mouse.down()
+    page.mouse.move(x + 50 + 60 * scale, y + 20 + 60 * scale)
+    page.mouse.up()
+    clockwork.sigma()
+    mark = clockwork.desk.marks[0]
+    assert [mark[name] for name in "xywh"] == pytest.approx([320, 240, 61, 61], abs=2)
+    page.keyboard.press("0")
     clockwork.clear()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import io
 import json
 import shlex
 import shutil
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import threading
 import tomllib
+import zipfile
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -31,6 +33,7 @@ pytest.importorskip("uvicorn", reason="pip install 'torch-ecc[view]'")
 from torch_ecc.view.desk import Desk
 from torch_ecc.view.history import MOST, History
 from torch_ecc.view.marks import as_settings, outlook, read_outline
+from torch_ecc.view.rois import read_rois
 from torch_ecc.view.run import State
 from torch_ecc.view.server import Server
 
@@ -102,6 +105,61 @@ def test_a_rectangle_of_imagej_is_its_pixels():
     for text in ("", "hello", "makePolygon(1,2)", "3 4"):
         with pytest.raises(ValueError, match="outline: expected a line 'X Y' for each of three corners"):
             read_outline(text)
+
+
+def archive(files: dict[str, bytes]) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in files.items():
+            file.writestr(name, data)
+    return packed.getvalue()
+
+
+def test_files_of_imagej_are_marks():
+    """One region or many; a rectangle is its pixels, an outline lies half a pixel off ours."""
+    roifile = pytest.importorskip("roifile", reason="pip install 'torch-ecc[view]'")
+    polygon = roifile.ImagejRoi.frompoints([[10, 20], [30, 20], [20, 40]])
+    fine = roifile.ImagejRoi.frompoints([[10.25, 20], [30, 20], [20.5, 40]])
+    box = roifile.ImagejRoi(roitype=roifile.ROI_TYPE.RECT, left=10, top=20, right=41, bottom=45)
+    wanted = [
+        {"points": [[9.5, 19.5], [29.5, 19.5], [19.5, 39.5]]},
+        {"points": [[9.75, 19.5], [29.5, 19.5], [20, 39.5]]},
+        {"x": 25, "y": 32, "w": 31, "h": 25},
+    ]
+    rois = [each.tobytes() for each in (polygon, fine, box)]
+    assert [read_rois("a.roi", data) for data in rois] == [[mark] for mark in wanted]
+    assert read_rois("all.zip", archive({f"{k}.roi": data for k, data in enumerate(rois)})) == wanted
+    line = roifile.ImagejRoi(roitype=roifile.ROI_TYPE.LINE, x1=1, y1=2, x2=3, y2=4).tobytes()
+    for data, words in [
+        (line, "no rectangle, oval or polygon, but line"),
+        (b"Iout and then nothing", "no region of ImageJ's"),
+        (b"", "no region of ImageJ's"),
+        (b"PK but no archive", "no archive"),
+        (archive({"a.txt": b"a"}), "1 to 500 .roi files"),
+        (archive({"a.roi": bytes(1 << 21)}), "at most 1 MiB"),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            read_rois("odd", data)
+
+
+def test_changes_of_marks_are_taken_back_and_made_again(video):
+    """Step by step, however a mark came; settings stay, and another change ends what could be made again."""
+    desk = Desk({"input": str(video)})
+    desk.undo()
+    desk.mark([BOX])
+    desk.grid(2, 31)
+    grid = desk.marks
+    desk.set({"um_per_px": 0.5})
+    desk.mark([])
+    for step, marks in [("undo", grid), ("undo", [BOX]), ("redo", grid), ("undo", [BOX]), ("undo", []), ("undo", [])]:
+        getattr(desk, step)()
+        assert desk.marks == marks
+        assert len(desk.outlooks) == len(marks)
+        assert desk.values.get("grid") == (2 if marks is grid else None)
+        assert desk.values["um_per_px"] == 0.5
+    assert (desk.told()["undo"], desk.told()["redo"]) == (False, True)
+    desk.mark([BOX | {"x": 70}])
+    assert (desk.told()["undo"], desk.told()["redo"]) == (True, False)
 
 
 @pytest.mark.parametrize(
@@ -187,6 +245,7 @@ def test_what_does_not_fit_changes_nothing(video):
         (lambda: desk.grid(2, 300), "300x300 px each, within 160x120 px"),
         (lambda: desk.mark([{"x": "left", "y": 0, "w": 9, "h": 9}]), "centers"),
         (lambda: desk.outline("nothing"), "outline"),
+        (lambda: desk.rois("nothing.roi", "?"), "nothing.roi is no region"),
         (lambda: desk.picture(90), "has no frame 90"),
     ]:
         with pytest.raises((ValueError, TypeError), match=words):

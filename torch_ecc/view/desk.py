@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from base64 import b64decode
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -25,11 +26,14 @@ from torch_ecc.io.summary import plain
 from torch_ecc.view.history import History
 from torch_ecc.view.marks import Mark, Outlook, as_settings, boxes, outlook, read_outline
 from torch_ecc.view.pictures import jpeg
+from torch_ecc.view.rois import read_rois
 from torch_ecc.view.run import Run, State
 
 PLACED = ("centers", "size", "polygons", "grid", "template")
 SETTINGS = ("frames", "fps", "um_per_px", "out", "force", "overlay")  # that a page may change
 DEFAULTS = {name: each.default for name, each in TrackJob.__dataclass_fields__.items()}
+MOST_STEPS = 99  # that can be taken back, and one
+Placing: TypeAlias = tuple[dict[str, Any], list[Mark]]
 FALLEN = (ValueError, OSError, MemoryError)
 
 
@@ -46,6 +50,7 @@ class Desk:
         self.history: History | None = None
         self.run: Run | None = None
         self.problem: str | None = None
+        self._past, self._future = list[Placing](), list[Placing]()
         self._map: tuple[Tensor, TextureMap] | None = None
         self.looks = 0
         try:
@@ -87,6 +92,7 @@ class Desk:
             templates = choose_templates(self.job, self.frame)
             marks = boxes(templates.centers, templates.size)
         self._place(self.values, marks)
+        self._past = []
 
     def _change(self, values: Mapping[str, Any]) -> None:
         """Take these values, if they fit."""
@@ -104,8 +110,32 @@ class Desk:
     def _place(self, values: Mapping[str, Any], marks: list[Mark]) -> None:
         """Take the values that say these marks, and what is to be expected of each, all at once."""
         outlooks = outlook(self.frame, marks, values) if marks else []
+        before = self._placing()
         self._change(values)
+        if marks != self.marks:
+            self._past, self._future = [*self._past[-MOST_STEPS:], before], []
         self.marks, self.outlooks = marks, outlooks
+
+    def _placing(self) -> Placing:
+        """The marks, and the values that say them."""
+        return {name: self.values[name] for name in PLACED if name in self.values}, self.marks
+
+    def undo(self) -> None:
+        """The marks as they were before their last change."""
+        self._step(self._past, self._future)
+
+    def redo(self) -> None:
+        """The change that was taken back last, once more."""
+        self._step(self._future, self._past)
+
+    def _step(self, back: list[Placing], forth: list[Placing]) -> None:
+        if not back or self.running:
+            return
+        (placed, marks), now, past, future = back[-1], self._placing(), self._past, self._future
+        self._place(self._unplaced() | placed, marks)
+        back.pop()
+        forth.append(now)
+        self._past, self._future = past, future  # a step is no change of its own
 
     def _unplaced(self) -> dict[str, Any]:
         """The values but for where the patches are."""
@@ -131,6 +161,8 @@ class Desk:
             "settings": {name: self.values.get(name) for name in SETTINGS} | {"overlay": self.job.overlay},
             "first": self.first,
             "marks": self.marks,
+            "undo": bool(self._past),
+            "redo": bool(self._future),
             "outlooks": [each._asdict() for each in self.outlooks],
             "tracked": self.tracked,
             "ready": bool(self.marks or self.job.template),
@@ -177,6 +209,10 @@ class Desk:
     def outline(self, text: str) -> None:
         """One mark more, from a text that ImageJ wrote."""
         self.mark([*self.marks, read_outline(text)])
+
+    def rois(self, name: str, data: str) -> None:
+        """Marks more, from a file of ImageJ's, its bytes in base 64."""
+        self.mark([*self.marks, *read_rois(name, b64decode(data))])
 
     def grid(self, count: int, size: int) -> None:
         """``count`` patches of ``size`` px in a row, and rows to match, where there is texture enough."""

@@ -82,8 +82,7 @@ def _sentence(error: ValueError) -> str:
 def read_outline(text: str) -> Mark:
     """A mark from what ImageJ writes: the recorder's makeRectangle(...) or makePolygon(...), or a list of coordinates.
 
-    ImageJ counts from the outer corner of the first pixel: its outlines are half a pixel more than ours. ValueError if
-    there is no outline in the text.
+    ValueError if there is no outline in the text.
     """
     call = re.search(r"make(Rectangle|Polygon|Selection)\s*\(([^)]*)\)", text)
     if call and call[1] == "Rectangle":
@@ -101,4 +100,9 @@ def read_outline(text: str) -> Mark:
             "outline: expected a line 'X Y' for each of three corners or more, as ImageJ saves XY coordinates, or "
             "makeRectangle(...) or makePolygon(...) as its recorder shows them"
         )
-    return {"points": [[x - 0.5, y - 0.5] for x, y in pairs]}
+    return at_pixel_centres(pairs)
+
+
+def at_pixel_centres(corners: Sequence[Sequence[float]]) -> Mark:
+    """An outline with corners (x, y) as ImageJ counts them: from the outer corner of the first pixel."""
+    return {"points": [[x - 0.5, y - 0.5] for x, y in corners]}

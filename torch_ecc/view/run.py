@@ -54,16 +54,14 @@ class Run:
         self._stopping.set()
         self._thread.join()
 
+    def counted(self) -> dict[str, Any]:
+        """How far it is."""
+        return {"state": self.state, "done": len(self.history), "total": self.total, "rate": self.rate}
+
     def told(self) -> dict[str, Any]:
         """What a page shows of it."""
-        return {
-            "state": self.state,
-            "done": len(self.history),
-            "total": self.total,
-            "rate": self.rate,
-            "words": self.words,
-            "latency": self.latency.words() if self.state is State.RUNNING else [],
-        }
+        latency = self.latency.words() if self.state is State.RUNNING else []
+        return self.counted() | {"words": self.words, "latency": latency}
 
     def _track(self) -> None:
         try:

@@ -19,9 +19,9 @@ export class Link extends EventTarget {
     });
   }
 
-  // The last picture was drawn: the next one may come.
-  shown() {
-    if (this.#socket.readyState === WebSocket.OPEN) this.#socket.send('{"do": "shown"}');
+  // All that was sent is drawn: what is new may come, with pictures of so many px at most.
+  shown(side) {
+    if (this.#socket.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify({ do: "shown", with: { side } }));
   }
 
   #open() {

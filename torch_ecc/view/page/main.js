@@ -47,20 +47,27 @@ link.addEventListener("state", ({ detail }) => {
 link.addEventListener("rows", ({ detail }) => {
   curves.add(detail.data, detail.width, detail.new);
   if (detail.run && state) {
-    state.run = detail.run;
+    state.run = { ...state.run, ...detail.run };
     renderProgress();
   }
   renderShown();
 });
-link.addEventListener("picture", async ({ detail }) => {
-  const image = await createImageBitmap(detail.data);
-  if (following && detail.row) {
-    cursor = detail.row[0];
-    stage.setImage(image);
-    renderShown(detail.row);
-  }
-  requestAnimationFrame(() => link.shown());
+let decoding = null; // of the last picture
+link.addEventListener("picture", ({ detail }) => {
+  if (following && detail.row) decoding = showPicture(detail);
 });
+link.addEventListener("all", async () => {
+  await decoding?.catch(() => null);
+  const next = document.hidden ? (call) => setTimeout(call, 1000) : requestAnimationFrame;
+  next(() => link.shown(stage.side()));
+});
+
+async function showPicture({ data, row }) {
+  const image = await createImageBitmap(data);
+  cursor = row[0];
+  stage.setImage(image);
+  renderShown(row);
+}
 
 // What is asked, and the server's sentence if it is refused.
 async function ask(what, given) {
@@ -145,6 +152,7 @@ function renderMarks() {
   table.hidden = state.marks.length === 0;
   $("#patches .empty").hidden = state.marks.length > 0;
   $("#clear").hidden = state.marks.length < 2;
+  for (const step of ["undo", "redo"]) $(`#${step}`).disabled = running() || !state[step];
   $("tbody", table).replaceChildren(...state.marks.map(row));
   if (state.marks.length > 8 && !table.parentElement.classList.contains("scroll")) {
     const scroll = document.createElement("div");
@@ -479,6 +487,7 @@ $("#follow").onclick = () => ((following = true), renderShown());
 $("#look").onclick = () => ask("look");
 $("#here").onclick = () => ask("set", { settings: { frames: `${cursor}:` } });
 $("#clear").onclick = () => mark([]);
+for (const step of ["undo", "redo"]) $(`#${step}`).onclick = () => !running() && ask(step);
 curves.addEventListener("seek", ({ detail }) => seek(detail));
 
 $("#selected").onsubmit = (event) => event.preventDefault();
@@ -498,6 +507,24 @@ $("#paste").onsubmit = async (event) => {
   event.preventDefault();
   const form = event.target;
   if ((await ask("outline", { text: form.text.value })) !== null || $("#error").hidden) form.text.value = "";
+};
+// Files of ImageJ's regions: dropped anywhere, chosen, or pasted.
+async function readRois(files) {
+  for (const file of files) {
+    const bytes = new Uint8Array(await file.arrayBuffer());
+    const data = btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+    if ((await ask("rois", { name: file.name, data })) === null && !$("#error").hidden) return;
+  }
+}
+addEventListener("dragover", (event) => event.preventDefault());
+addEventListener("drop", (event) => {
+  event.preventDefault();
+  if (!running()) readRois(event.dataTransfer.files);
+});
+addEventListener("paste", ({ clipboardData }) => !running() && readRois(clipboardData.files));
+$("#roi").onchange = async ({ target }) => {
+  await readRois([...target.files]);
+  target.value = ""; // the same file may be chosen again
 };
 $("#settings").onsubmit = (event) => event.preventDefault();
 $("#settings").onchange = ({ target }) => {
@@ -519,6 +546,10 @@ all("[data-copy]").forEach((button) => {
 });
 
 addEventListener("keydown", (event) => {
+  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !event.target.matches("input, textarea")) {
+    $(event.shiftKey ? "#redo" : "#undo").click();
+    return event.preventDefault();
+  }
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, textarea, select")) return;
   const tool = { r: "box", p: "outline", s: "scale", h: "pan" }[event.key.toLowerCase()];
   if (tool) setTool(tool);

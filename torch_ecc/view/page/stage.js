@@ -21,6 +21,7 @@ export class Stage extends EventTarget {
   #view = { scale: 1, x: 0, y: 0 }; // a point p is at (p + 0.5) scale + (x, y), in CSS px of the canvas
   #whole = true; // the view is the whole frame
   #action = null; // what a pointer that is down does
+  #fingers = new Map(); // where those are that touch, by the pointer's number
   #points = []; // of the outline that is being clicked
   #hover = null;
   #line = null; // the last known length
@@ -33,7 +34,7 @@ export class Stage extends EventTarget {
     canvas.addEventListener("pointerdown", (event) => this.#down(event));
     canvas.addEventListener("pointermove", (event) => this.#move(event));
     canvas.addEventListener("pointerup", (event) => this.#up(event));
-    canvas.addEventListener("pointercancel", () => this.cancel());
+    canvas.addEventListener("pointercancel", (event) => (this.#fingers.delete(event.pointerId), this.cancel()));
     canvas.addEventListener("dblclick", () => this.#closeOutline());
     canvas.addEventListener("wheel", (event) => this.#wheel(event), { passive: false });
     canvas.addEventListener("keydown", (event) => this.#key(event));
@@ -65,6 +66,11 @@ export class Stage extends EventTarget {
     this.draw();
   }
 
+  // The longer side of the whole picture as it is seen, px of the screen: more would not be.
+  side() {
+    return Math.ceil(this.#view.scale * devicePixelRatio * Math.max(this.#width, this.#height));
+  }
+
   // The middle of what is seen, whole px.
   middle() {
     const p = this.#toFrame(this.canvas.clientWidth / 2, this.canvas.clientHeight / 2);
@@ -81,7 +87,7 @@ export class Stage extends EventTarget {
 
   zoom(factor, x = this.canvas.clientWidth / 2, y = this.canvas.clientHeight / 2) {
     const view = this.#view;
-    const scale = Math.min(Math.max(view.scale * factor, 0.02), 64);
+    const scale = bounded(view.scale * factor);
     const by = scale / view.scale;
     this.#view = { scale, x: x - (x - view.x) * by, y: y - (y - view.y) * by };
     this.#whole = false;
@@ -120,6 +126,7 @@ export class Stage extends EventTarget {
 
   #down(event) {
     this.canvas.focus({ preventScroll: true });
+    if (event.pointerType === "touch" && this.#touch(event)) return;
     const p = this.#pointer(event);
     const pan = this.tool === "pan" || event.button === 1;
     if (!pan && (event.button !== 0 || (!this.editable && this.tool !== "scale"))) return;
@@ -134,7 +141,32 @@ export class Stage extends EventTarget {
     }
   }
 
+  // Two fingers: what the first one began is no mark, they zoom and pan.
+  #touch(event) {
+    this.canvas.setPointerCapture(event.pointerId);
+    this.#fingers.set(event.pointerId, [event.offsetX, event.offsetY]);
+    if (this.#fingers.size !== 2) return this.#fingers.size > 2;
+    const points = this.tool === "outline" ? this.#points.slice(0, -1) : [];
+    this.cancel();
+    this.#points = points;
+    this.#action = { kind: "pinch", fingers: [...this.#fingers.values()], view: { ...this.#view } };
+    return true;
+  }
+
+  #pinch({ fingers, view }) {
+    const [before, now] = [fingers, [...this.#fingers.values()]].map(([a, b]) => ({
+      middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2],
+      apart: Math.max(Math.hypot(a[0] - b[0], a[1] - b[1]), 1),
+    }));
+    const scale = bounded((view.scale * now.apart) / before.apart);
+    const by = scale / view.scale;
+    const [x, y] = [view.x, view.y].map((start, k) => now.middle[k] - (before.middle[k] - start) * by);
+    this.#view = { scale, x, y };
+    this.#whole = false;
+  }
+
   #move(event) {
+    if (this.#fingers.has(event.pointerId)) this.#fingers.set(event.pointerId, [event.offsetX, event.offsetY]);
     const p = this.#pointer(event);
     this.#hover = p;
     const action = this.#action;
@@ -142,6 +174,8 @@ export class Stage extends EventTarget {
       this.#view.x = action.view.x + event.offsetX - action.x;
       this.#view.y = action.view.y + event.offsetY - action.y;
       this.#whole = false;
+    } else if (action?.kind === "pinch") {
+      if (this.#fingers.size === 2) this.#pinch(action);
     } else if (action?.kind === "scale") {
       action.to = p;
       this.#tell("draft", { length: this.#lengthOf(action) });
@@ -155,7 +189,8 @@ export class Stage extends EventTarget {
     this.draw();
   }
 
-  #up() {
+  #up(event) {
+    this.#fingers.delete(event.pointerId);
     const action = this.#action;
     if (!action) return; // a corner of an outline: it is done with the press
     this.#action = null;
@@ -349,6 +384,11 @@ export class Stage extends EventTarget {
   #tell(name, detail) {
     this.dispatchEvent(new CustomEvent(name, { detail }));
   }
+}
+
+// A zoom within reason: screen px for one of the frame's.
+function bounded(scale) {
+  return Math.min(Math.max(scale, 0.02), 64);
 }
 
 // The corners of what a mark covers: of a box around its outermost pixels.
