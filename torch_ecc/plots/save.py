@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -14,7 +15,7 @@ def save(figure: Figure, path: Path, dpi: int) -> Path:
     part.parent.mkdir(parents=True, exist_ok=True)
     part.unlink(missing_ok=True)  # a link that bears its name is not followed
     form = path.suffix.lstrip(".") or "png"
-    quick = {"pil_kwargs": {"compress_level": 3}} if form == "png" else {}
+    quick: Any = {"pil_kwargs": {"compress_level": 3}} if form == "png" else {}
     try:
         figure.savefig(part, dpi=dpi, format=form, **quick)
     except OSError:
