@@ -35,6 +35,7 @@ from torch_ecc.sim import Camera, harmonic, placed
 
 SECTIONS = ("scatters", "apart", "lenses", "speed", "steps", "clockwork")
 APART = (0, 1, 5, 10, 15)
+TRUST = (0.03, 0.03, math.radians(0.1))  # px, px, rad: of the clockwork's truth, which is another tracker's
 UM_PER_PX = 0.55  # of the paper's camera at 10 x
 
 
@@ -222,29 +223,34 @@ def clockwork(folder: Path) -> list[Number]:
     rows, figures = [], []
     for fact in bodies:
         body = te.Body(session.tracker, [fact["patches"]])(track)
-        words, px, deg = _nearest(body, facts)
+        words, *cells = _nearest(body, facts)
         still = float(rms(body.displacement[:, 0, :2].flatten())) if fact["stands_still"] else math.nan
         words = "still frame" if fact["stands_still"] else words
-        rows.append((str(len(fact["patches"])), words, px, deg, f"{still:.4f}"))
-    header = ("patches", "body of the truth", "px rms / max", "deg rms / max", "moved px rms")
+        cells = ["", "", ""] if fact["stands_still"] else cells
+        rows.append((str(len(fact["patches"])), words, *cells, f"{still:.4f}"))
+    header = ("patches", "body of the truth", "px rms / max", "deg rms / max", "over sigma and trust", "moved px rms")
     show("mechanism_video --grid 30 --size 21 --bodies 3", header, rows)
     return figures
 
 
-def _nearest(body: te.BodyEstimate, facts: dict) -> tuple[str, str, str]:
-    """The body of the truth that this one is, and the errors there."""
-    best = ("", math.inf, "", "")
+def _nearest(body: te.BodyEstimate, facts: dict) -> tuple[str, str, str, str]:
+    """The body of the truth that this one is, the errors there, and what they are over our sigma and its trust."""
+    best, least = ("", "", "", ""), math.inf
     for name, one in facts["bodies"].items():
         point = torch.tensor(one["centre_px"], dtype=torch.float64)
         rows = [[f["bodies"][name][k] for k in ("tx", "ty", "theta_deg")] for f in facts["frames"][-55:]]
         truth = torch.tensor(rows, dtype=torch.float64) * torch.tensor([1, 1, -math.pi / 180])
-        error = body.at(point)[0][1:, 0] - torch.cat((point, point.new_zeros(1))) - truth
-        px, deg = error[:, :2], error[:, 2].rad2deg()
-        size = float(rms(px.flatten())) + abs(float(rms(deg)))
-        if size < best[1]:
+        pose, covariance = (value[1:, 0] for value in body.at(point))
+        error = pose - torch.cat((point, point.new_zeros(1))) - truth
+        both = covariance.diagonal(dim1=1, dim2=2) + torch.tensor(TRUST).double().square()
+        px, deg, ratio = error[:, :2], error[:, 2].rad2deg(), error / both.sqrt()
+        size = float(rms(px.flatten())) + float(rms(deg))
+        if size < least:
             words = f"{float(rms(px.flatten())):.3f} / {float(px.abs().max()):.3f}"
-            best = (name, size, words, f"{float(rms(deg)):.3f} / {float(deg.abs().max()):.3f}")
-    return best[0], best[2], best[3]
+            over = ", ".join(f"{v:.1f}" for v in rms(ratio).tolist())
+            best = (name, words, f"{float(rms(deg)):.3f} / {float(deg.abs().max()):.3f}", over)
+            least = size
+    return best
 
 
 @click.command()

@@ -9,7 +9,7 @@ import torch
 from engines import BACKENDS
 from torch import Tensor
 
-from torch_ecc import Status, Tracker
+from torch_ecc import Body, BodyEstimate, Status, Tracker
 from torch_ecc.core.pose import rotation
 from torch_ecc.sim import PlaneWaves
 from torch_ecc.track.shutter import NODES, Shutter
@@ -192,3 +192,27 @@ def sense(frame: Tensor, seed: int) -> Tensor:
 def test_times_that_no_camera_has_are_refused(options: dict, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         Tracker(torch.rand(FRAME), [(70.0, 58.0)], SIZE, **options)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_body_is_where_it_is_at_one_instant(whole: bool) -> None:
+    """Its patches are on rows that see it a third of a frame's time apart, and 1 px: a turn, if nobody knew."""
+    times = [float(k) for k in range(1, 10)]
+    frames = [exposed(drift, t) for t in times]
+    places = [(40.0, 34.0), (72.0, 36.0), (42.0, 72.0), (74.0, 70.0)]
+    found = []
+    for options in ({"line_time": LINE / FPS, "fps": FPS}, {}):
+        tracker = Tracker(exposed(drift, 0.0), places, 27, search=False, **options)
+        body = Body(tracker)
+        if whole:
+            found.append(body(tracker.track_sequence(frames)))
+        else:
+            each = [body(tracker(frame)) for frame in frames]
+            found.append(BodyEstimate(*(torch.stack(values) for values in zip(*each, strict=True))))
+    middle = torch.tensor(places).double().mean(0) - drift(0.0)[:2]
+    along = torch.stack([truth(lambda t: drift(t) + torch.cat((middle, middle[:1] * 0)), t) for t in times])
+    error, without = (bodies.pose[6:, 0] - along[6:] for bodies in found)
+    assert float(error[:, :2].abs().max()) < 5e-3
+    assert float(error[:, 2].abs().max()) < 2e-4
+    assert float(without[:, 2].abs().max()) > 1e-3
+    assert bool((found[0].chi2[6:] < 0.1 * found[1].chi2[6:]).all())

@@ -17,8 +17,10 @@ from torch_ecc.core.pose import compose, inverse, rotation
 from torch_ecc.core.reference import MARGIN
 from torch_ecc.core.verdict import unknown
 from torch_ecc.records.lens import Lens
+from torch_ecc.track.shutter import Motion
 from torch_ecc.track.tracker import Tracker
 
+PASSES = 2  # until it is known when the row of a body's reference point is exposed
 USED = 0.5  # of its weight: a patch with less is not counted among those that agree
 
 
@@ -98,7 +100,9 @@ class Body(nn.Module):
     distortion, and residuals those in the frame as it is. Patches that are not CONVERGED are left out, as are those
     that disagree with most others (``BodyEstimate.used``); where a body has lost a patch, it tells the tracker where to
     look for it in the next frame. Called with a whole Track, bodies of all its frames come at once, and the tracker is
-    told nothing. ValueError for what does not fit.
+    told nothing. Under a rolling shutter (``line_time``) a pose is of the instant at which the row of the body's
+    reference point is exposed, to which patches on other rows are taken by their own motion. ValueError for what does
+    not fit.
     """
 
     before: Tensor
@@ -123,14 +127,30 @@ class Body(nn.Module):
         layout = self._layout(estimate.pose.device)
         if estimate.pose.shape[-2:] != layout.place.shape:
             raise ValueError(f"Body: estimate must be of {len(layout.place)} patches, got {tuple(estimate.pose.shape)}")
-        single = estimate.pose.dim() == 2
-        pose, covariance, good = estimate.pose, estimate.covariance, estimate.status == Status.CONVERGED
-        if not single:
-            return record(fuse(pose, covariance, good, layout), good, layout, layout.start)
-        found = fuse(pose[None], covariance[None], good[None], layout)
+        shutter, motion, good = self.tracker.shutter, None, estimate.status == Status.CONVERGED
+        if estimate.pose.dim() == 3:
+            motion = shutter.throughout(estimate) if shutter.line else None
+            return record(self._fused(estimate, motion, layout), good, layout, layout.start)
+        if shutter.line:
+            motion = Motion(*(v[None] for v in shutter.newest(self.tracker._buffers)))
+        found = self._fused(Estimate(*(v[None] for v in estimate)), motion, layout)
         body = BodyEstimate(*(v[0] for v in record(found, good[None], layout, self.before)))
         self._guide(estimate, body, layout)
         return body
+
+    def _fused(self, estimate: Estimate, motion: Motion | None, layout: Layout) -> Fusion:
+        """The bodies of F frames, (F, R, ...). With a ``motion`` (F, R, 3) the rows of patches are exposed one after
+        the other: all are brought to the instant of the row of their body's reference point."""
+        pose, covariance, good = estimate.pose, estimate.covariance, estimate.status == Status.CONVERGED
+        found = fuse(pose, covariance, good, layout)
+        if motion is None:
+            return found
+        for _ in range(PASSES):
+            seen = found.pose[..., :2] if self.lens is None else self.lens.distort(found.pose[..., :2])
+            later = self.tracker.shutter.line * (seen[..., layout.body, 1] - pose[..., 1])
+            there, spread = motion.at(pose, covariance, later)
+            found = fuse(there, spread, good, layout)
+        return found
 
     def _layout(self, device: torch.device) -> Layout:
         if self.layout.place.device != device:

@@ -47,6 +47,12 @@ class Motion(NamedTuple):
     of_velocity: Tensor
     of_acceleration: Tensor
 
+    def at(self, pose: Tensor, covariance: Tensor, later: Tensor) -> tuple[Tensor, Tensor]:
+        """Where what is at ``pose`` (..., 3) with a ``covariance`` (..., 3, 3) is so many frames ``later`` (...)."""
+        t = later[..., None]
+        more = self.of_velocity * t.square() + self.of_acceleration * t.square().square() / 4
+        return pose + self.velocity * t + self.acceleration * t.square() / 2, covariance + torch.diag_embed(more)
+
 
 class Shutter(NamedTuple):
     """``line``: frames from one row to the next, 0 for all rows at once."""
@@ -183,6 +189,28 @@ class Shutter(NamedTuple):
             added.append(torch.where(known[:, order - 1, None], values[:, 0] * product, 0.0))
             product = product * ago[:, order - 1, None]
         return torch.stack(added, 1), 2 * ((1 / ago).cumsum(1) - 1 / ago), known
+
+    def newest(self, state: State) -> Motion:
+        """That of the templates of a ``state`` in the newest frame, which it holds already."""
+        past, ages = state["past_poses"], state["past_ages"]
+        older = {"past_poses": past.roll(-1, 1), "past_ages": (ages.roll(-1, 1) - ages[:, :1]).clamp(min=0)}
+        older["past_ages"][:, -1] = 0
+        return self.motion(past[:, 0], {**state, **older})
+
+    def throughout(self, track: Estimate) -> Motion:
+        """That of R templates in each frame of a ``track`` (F, R, ...) by the frames before: (F, R, 3)."""
+        good, count = Status.good(track.status) & (track.origin == Origin.TRACKED), len(track.pose)
+        frame = torch.arange(count, device=track.pose.device)[:, None]
+        before = frame - torch.arange(1, NODES + 2, device=frame.device)  # (F, NODES + 1)
+        known = (before >= 0)[..., None] & good[before.clamp(min=0)]  # (F, NODES + 1, R)
+        past = track.pose[before.clamp(min=0)].transpose(1, 2).flatten(0, 1)
+        ages = (frame - before)[..., None] * known
+        ages = ages.transpose(1, 2).flatten(0, 1).to(past)
+        order = torch.where(ages > 0, ages, torch.inf).argsort(dim=1, stable=True)  # those that are known come first
+        past, ages = past.gather(1, order[..., None].expand_as(past)), ages.gather(1, order)
+        noise = torch.where(good[..., None], track.covariance.diagonal(0, 2, 3) / 2, 0.0).flatten(0, 1)
+        state = {"past_poses": past, "past_ages": ages, "past_noise": noise, "past_missing": torch.zeros_like(past)}
+        return Motion(*(v.unflatten(0, good.shape) for v in self.motion(track.pose.flatten(0, 1), state)))
 
     def remember(self, state: State, estimate: Estimate) -> None:
         """One frame on: what was tracked is the newest of the earlier poses, what a search has found the only one."""
