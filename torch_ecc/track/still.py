@@ -31,8 +31,8 @@ from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import eroded, picked, seen_through
 from torch_ecc.core.verdict import expected_score, within_margin
 from torch_ecc.search.locate import pose_distance
-from torch_ecc.track.advance import Remembering
 from torch_ecc.track.frame_mask import unexplained
+from torch_ecc.track.look import Look as TrackersLook
 
 AROUND = 3  # px: pixels are compared in squares of so many
 STILL = 3.0  # times the noise of a difference: so much is left of squares that stand still
@@ -301,19 +301,19 @@ class Watch(NamedTuple):
 
 
 def without_marks(
-    reference: Reference, image: Tensor, look: Remembering, estimate: Estimate, start: Tensor
+    tracker: TrackersLook, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor
 ) -> tuple[Estimate, bool]:
-    """The ``estimate`` of R templates in an ``image`` (1, 1, H, W), as one ``look`` from the ``start`` (R, 3) on has
-    made it, without the marks that it shows; and whether there are new ones, in the state."""
-    state, watch, odd = look.state, Watch.of(look.state), look.odd
-    if odd is None:
-        return estimate, False
+    """The ``estimate`` of R templates of a ``tracker`` in an ``image`` (1, 1, H, W), from the ``start`` (R, 3) on,
+    without the marks that it shows where there is more left than any noise leaves, ``odd`` (R,) bool; and whether there
+    are new ones, in the state."""
+    state, reference = tracker.state, tracker.references[0]
+    watch = Watch.of(state)
     moved, found = pose_distance(estimate.pose, state["start"], radius=reference.place.radius), False
     for r in watch.due(odd, moved):
         at = torch.tensor([r], device=start.device)
         alone = reference._replace(sight=None, heed=None).select(at)
         first, home = state["first"][0, 0], state["start"][at]
-        still = Still(alone, image, first, watch.level, start[at], home, watch.marks == 0, look.settings)
+        still = Still(alone, image, first, watch.level, start[at], home, watch.marks == 0, tracker.settings)
         trial = still.without_marks(estimate.pose[at])
         if trial is None:
             watch.far[r] = moved[r].maximum(watch.far[r])

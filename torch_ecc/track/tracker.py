@@ -16,18 +16,17 @@ from torch_ecc.core.dead_lines import DeadLines
 from torch_ecc.core.estimate import Estimate, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
-from torch_ecc.core.pose import ahead
 from torch_ecc.core.pyramid import check_levels, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
 from torch_ecc.core.robust import Memory
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, seen_through
-from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, image_pyramid
-from torch_ecc.track.advance import Remembering, advanced, advanced_in_doubt, beginning, check_prediction, skipped
+from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator
+from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, skipped
 from torch_ecc.track.budget import Budget, income
-from torch_ecc.track.coarse import coarse_to_fine
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told
+from torch_ecc.track.look import Look
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
 from torch_ecc.track.sensor import dead_in, kept, shown
@@ -35,7 +34,7 @@ from torch_ecc.track.shutter import Shutter
 from torch_ecc.track.still import Watch, without_marks
 from torch_ecc.track.textureless import warn_of_textureless
 
-DERIVED = ("references", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
+DERIVED = ("references", "_look", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
 
 
 class SequenceError(ValueError):
@@ -64,9 +63,9 @@ class Tracker(nn.Module):
     more seldom the longer it stays so (every 16th frame in the end); ``search_share``: of the time, what searches may
     take at most in the long run (1: no bound); ``max_step``: (px, deg), how far a template's
     centre moves, and how far it turns, from one frame to the next at most: nothing farther is believed, nor looked at;
-    ``backend``: "auto", "torch" or "native", see settings.Settings. ``average``: the templates become the mean of so
-    many frames, the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last so
-    many frames, again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up,
+    ``backend``: "auto", "torch", "native" or "fused", see settings.Settings. ``average``: the templates become the mean
+    of so many frames, the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last
+    so many frames, again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up,
     and sigma tells what the anchor is still worth. Nothing is learned from frames that are not CONVERGED or are
     covered, nor where something is suddenly another. ``line_time``: seconds from the exposure of one row to the next,
     of a camera with a rolling shutter that takes ``fps`` frames per second: poses are those of the instant at which the
@@ -209,6 +208,8 @@ class Tracker(nn.Module):
         self.references = [watch.seen(first, self.start) if self.watches else first, *references[1:]]
         budget = Budget(self.credit, self.turn, math.prod(self.frame_shape), self.template.numel())
         self._recovery = Recovery(self.references[0], self.settings, budget, self.max_step)
+        moving = self.prediction == "velocity"
+        self._look = Look(self.references, self.settings, self.shutter, self._buffers, moving, self.frame_mask)
         alone = len(self.start) == 1 or self.frame_shape[0] > 1
         self._crowd = None if alone else Crowd(self.start[:, :2])
         sight = self.references[0].sight
@@ -312,12 +313,11 @@ class Tracker(nn.Module):
         if self.learns and self.template._version != self._version:  # by another handle of the same state
             self._use(self._prepared(self._buffers))
         image = image if self.dead is None else self.dead.repair(image)
-        start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image.detach()]
         self._recovery.budget.earn(self.income)
-        look, estimate = self._solve(image, images, start)
-        if self.watches:
-            estimate, marked = without_marks(self.references[0], images[0], look, estimate, start)
+        start, estimate, odd = self._look(image, images)
+        if self.watches and odd is not None:
+            estimate, marked = without_marks(self._look, images[0], estimate, start, odd)
             if marked:
                 self._use(self.references)
         estimate, past = self._within_reach(estimate), Past.of(state)
@@ -385,15 +385,6 @@ class Tracker(nn.Module):
         if not estimates:
             raise ValueError("track_sequence: frames must hold at least one frame, got none")
         return Track.stack(estimates)
-
-    def _solve(self, image: Tensor, images: list[Tensor], pose: Tensor) -> tuple[Remembering, Estimate]:
-        """Coarse to fine; ``images`` holds the ``image`` without gradients and grows to as many levels as there are."""
-        if self.levels > 1:
-            image = filled(image.float(), self.frame_mask)
-            images[:] = image_pyramid(image.detach(), self.levels)
-            pose = coarse_to_fine(self.references, images, pose, self.settings.max_iterations)
-        look = Remembering(self._buffers, image, self.settings)
-        return look, self.shutter.solve(look, self.references[0], pose, self._buffers, self.settings.tolerance)
 
 
 def _words(shape: tuple[int, ...]) -> str:

@@ -1,0 +1,107 @@
+"""A tracker's look at a frame asks the host nothing, so that a CUDA graph can repeat it; what repeats it here is what
+torch has traced of it."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from test_accelerator import NoWaiting
+from torch.fx.experimental.proxy_tensor import make_fx
+
+import torch_ecc as te
+from torch_ecc.sim.scene.scene import PlaneWaves
+from torch_ecc.track import look
+
+CENTRES = [(30.0, 28.0), (58.0, 40.0)]
+
+
+def frames(count: int = 4) -> list[torch.Tensor]:
+    """Of a scene that moves."""
+    k = torch.arange(count, dtype=torch.float64)
+    poses = torch.stack((44 + 0.7 * k, 35 - 0.4 * k, 0.01 * k), 1)
+    return list(PlaneWaves.random(seed=2).render(poses, (70, 90)).round().to(torch.uint8))
+
+
+def tracker(first: torch.Tensor, **options) -> te.Tracker:
+    return te.Tracker(
+        first, CENTRES, 21, **{"backend": "torch", "max_iterations": 2, "robust": False, "search": False} | options
+    )
+
+
+def traced(work, _):
+    """``look.recorded`` by the operations that torch sees, on the memory that they had."""
+    result = work()
+    operations = make_fx(work)()
+
+    def repeat() -> None:
+        for old, new in zip(*(torch.utils._pytree.tree_leaves(r) for r in (result, operations())), strict=True):
+            old.copy_(new)
+
+    return repeat, result
+
+
+@pytest.fixture
+def _graphs(blind, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host looks at nothing, and what was recorded is repeated."""
+    monkeypatch.setattr(look, "has_graphs", lambda device: True)
+    monkeypatch.setattr(look, "recorded", traced)
+
+
+@pytest.mark.parametrize(
+    "options", [{"robust": True}, {"prediction": "hold"}, {"line_time": 1e-5, "fps": 50.0}], ids=str
+)
+def test_it_waits_for_nothing(blind, options):
+    first, second = frames(2)
+    follow = tracker(first, **options)
+    image = second[None]
+    with NoWaiting():
+        start, estimate, _ = follow._look.made(image, [image])
+    assert start.shape == (2, 3)
+    assert te.Status.good(estimate.status).all()
+
+
+def test_what_was_recorded_serves_all_frames(request):
+    """Poses, and what is remembered, as without; records of earlier frames stay what they were."""
+    first, *others = frames()
+    plain = tracker(first)
+    request.getfixturevalue("blind")
+    wanted = [plain.track(frame) for frame in others]
+    request.getfixturevalue("_graphs")
+    follow = tracker(first)
+    found = [follow.track(frame) for frame in others]
+    assert follow._look.graph is not None
+    for a, b in zip(found, wanted, strict=True):
+        assert torch.equal(a.status, b.status)
+        assert (a.pose - b.pose).abs().max() < 1e-9
+        torch.testing.assert_close(a.covariance, b.covariance)
+    assert torch.equal(follow.trust, plain.trust)
+    for name, part in follow.state_dict().items():
+        if isinstance(part, torch.Tensor):
+            torch.testing.assert_close(part, plain.state_dict()[name])
+
+
+@pytest.mark.usefixtures("_graphs")
+def test_it_is_recorded_again_for_what_it_does_not_fit():
+    first, second, third, _ = frames()
+    follow = tracker(first)
+    follow.track(second)
+    graph = follow._look.graph
+    other = copy.deepcopy(follow)
+    assert other._look.graph is None
+    found = follow.track(third.float())
+    assert follow._look.graph is not graph
+    assert (found.pose - other.track(third).pose).abs().max() < 1e-4
+    follow.load_state_dict(other.state_dict())
+    assert follow._look.graph is None
+
+
+@pytest.mark.usefixtures("_graphs")
+def test_gradients_are_not_recorded():
+    first, second, *_ = frames()
+    follow = tracker(first)
+    frame = second.float().requires_grad_()
+    follow.track(frame).pose.sum().backward()
+    assert frame.grad.abs().max() > 0
+    assert follow._look.graph is None
