@@ -16,15 +16,17 @@ from torch_ecc.core.reference import Reference
 
 
 class Sandwich(NamedTuple):
-    """What of the covariance of B templates is the same in every frame. ``bread`` (B, 6, 3): rows 1, 2 and 0 of
-    Z W G^T off the other columns, and then 2, 0 and 1, whose cross products are its cofactors; ``meat`` = Z W (Z W)^T
-    off these, (B, 3, 3), and ``placed``, what of it the template's place is uncertain by; what white noise of unit
-    variance in the template adds to them, ``bread_bias`` and ``meat_bias``; ``place`` (B, 3, 3), see ``Noise``, and
-    ``alias`` (B, 3, 3), what aliasing adds to that if it all adds up."""
+    """What of the covariance of B templates is the same in every frame, (B, 3, 3) each. ``bread`` and ``next``: Z W G^T
+    off the other columns with rows 1, 2, 0, and with rows 2, 0, 1, whose cross products are its cofactors; ``meat`` =
+    Z W (Z W)^T off these, and ``placed``, what of it the template's place is uncertain by; what white noise of unit
+    variance in the template adds to them, ``bread_bias``, ``next_bias`` and ``meat_bias``; ``place``, see ``Noise``,
+    and ``alias``, what aliasing adds to that if it all adds up."""
 
     bread: Tensor
-    bread_bias: Tensor
+    next: Tensor
     meat: Tensor
+    bread_bias: Tensor
+    next_bias: Tensor
     meat_bias: Tensor
     placed: Tensor
     place: Tensor
@@ -33,13 +35,12 @@ class Sandwich(NamedTuple):
 
 def sandwich(noise: Noise, normal: Normal, interpolation: str = "") -> Sandwich:
     """Of templates with this ``noise`` and these ``normal`` equations, looked at by a sampler."""
-    bread, bias = (
-        torch.cat((each.roll(-1, 1), each.roll(-2, 1)), 1).contiguous() for each in (normal.bread, normal.bread_bias)
-    )
     alias, none = noise.alias.get(interpolation), torch.zeros_like(normal.meat)
+    of_pixels, of_noise = (normal.bread, normal.meat), (normal.bread_bias, normal.meat_bias)
+    sums = [m for bread, meat in (of_pixels, of_noise) for m in (bread.roll(-1, 1), bread.roll(-2, 1), meat)]
     placed = noise.place_share[:, None, None] * normal.meat
-    known = none if noise.place is None else noise.place, none if alias is None else alias @ alias.mT
-    return Sandwich(bread, bias, normal.meat, normal.meat_bias, placed, *known)
+    place = none if noise.place is None else noise.place
+    return Sandwich(*sums, placed, place, none if alias is None else alias @ alias.mT)
 
 
 def pose_covariance(
@@ -59,9 +60,9 @@ def pose_covariance(
     white noise would do each row of K feels, see ``clinging``; ``coherent`` (B, 1, 1): see ``coherence``.
     """
     variance, power, bias = (value.view(-1, 1, 1) for value in (variance, power, bias))
-    first, second = torch.addcmul(known.bread, bias, known.bread_bias, value=-1).split(3, 1)
-    cofactors = torch.linalg.cross(first, second)  # the inverse is their transpose / det
-    determinant = torch.bmm(first, cofactors.mT)[:, 1:2, 2:]
+    bread = torch.addcmul(known.bread, bias, known.bread_bias, value=-1)
+    cofactors = torch.linalg.cross(bread, torch.addcmul(known.next, bias, known.next_bias, value=-1))
+    determinant = torch.bmm(bread, cofactors.mT)[:, 1:2, 2:]  # the inverse is their transpose over it
     meat = torch.addcmul(known.meat, power, known.placed)  # all times gain^2
     meat = torch.addcmul(meat, power * bias, known.meat_bias, value=-1)
     white = variance / power
