@@ -37,7 +37,8 @@ def traced(work, _):
 
     def repeat() -> None:
         for old, new in zip(*(torch.utils._pytree.tree_leaves(r) for r in (result, operations())), strict=True):
-            old.copy_(new)
+            if old is not None:
+                old.copy_(new)
 
     return repeat, result
 
