@@ -25,7 +25,7 @@ from torch_ecc.track.tracker import Tracker
 
 Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 
-CONSTANT = ("template", "mask", "centre", "first", *LESSONS)  # of a tracker's state, or too large for a journal
+CONSTANT = ("template", "mask", "centre", "first", "marks", "heed", *LESSONS)  # of a state, or too large for a journal
 
 
 class Run:

@@ -15,7 +15,7 @@ from torch_ecc.core.native import engine as native
 from torch_ecc.core.pushed import left_of_push
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
-from torch_ecc.core.solution import Engine
+from torch_ecc.core.solution import Engine, Solution
 from torch_ecc.core.verdict import judge
 
 
@@ -79,19 +79,18 @@ def solve_again(
     settings: Settings,
     origin: Tensor | None = None,
     memory: robust.Memory | None = None,
-) -> tuple[Estimate, Tensor | None]:
-    """The same with a ``memory`` of the frames before; and the trust (B, blocks) to be remembered, None if it is
-    whole."""
+) -> tuple[Estimate, Solution]:
+    """The same with a ``memory`` of the frames before; and what it is judged from."""
     engine = engine_for(reference, image, settings)
     # What is left of a push would make half as much again of a graph.
     left = None if torch.compiler.is_compiling() else partial(left_of_push, engine, reference, image, settings)
     if not implicit.wanted(reference, image, pose):
         there = robust.solve(engine, reference, image, pose, settings, memory)
-        return judge(reference, there, pose, settings, origin, left), there.trust
+        return judge(reference, there, pose, settings, origin, left), there
     with torch.no_grad():
         there = robust.solve(engine, reference, image.detach(), pose.detach(), settings, memory)
     attached = implicit.attached(reference, image, pose, there, settings)
-    return judge(reference, attached, pose, settings, origin, left), there.trust
+    return judge(reference, attached, pose, settings, origin, left), there
 
 
 def engine_for(reference: Reference, image: Tensor, settings: Settings) -> Engine:

@@ -57,7 +57,8 @@ def attached(reference: Reference, image: Tensor, start: Tensor, found: Solution
     moved = (pose - pose.detach()).to(g.dtype)  # 0, with a gradient
     g = torch.baddbmm(g.unsqueeze(1), moved.unsqueeze(1), slopes).squeeze(1)
     weight = reference.weight if visible is None else reference.weight * visible
-    look = Solution(pose, found.error, found.iterations, *summed(seen, g, weight, trusted), seen.normal, found.trust)
+    sums = summed(seen, g, weight, trusted)
+    look = Solution(pose, found.error, found.iterations, *sums, seen.normal, found.trust, found.odd)
     return each(lambda value, slope: value if slope is value else carried(value, slope), found, look)
 
 

@@ -97,6 +97,7 @@ class _Groups(NamedTuple):
     coarse: Reference | None
     sight: Sight | None = None
     distortion: Tensor | None = None
+    heed: Tensor | None = None
 
 
 class Reference(_Groups):
@@ -104,7 +105,8 @@ class Reference(_Groups):
 
     ``coarse``: the same templates on a coarser grid, with a K of their own, for the first iterations; None where all
     pixels are few enough. ``sight``: None where the camera has no marks. ``distortion`` D (B, 2, 2): the templates are
-    seen at x = R(theta) (I + D) x' + t; None where they are seen as they are.
+    seen at x = R(theta) (I + D) x' + t; None where they are seen as they are. ``heed`` (B,) bool: which of them
+    the camera's marks bear on, None if they do on all.
     """
 
     @property

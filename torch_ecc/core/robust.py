@@ -115,12 +115,13 @@ def solve(
     doubtful = uneven | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
     if on_cpu:
         if not doubtful.any():
-            return found
+            return found._replace(odd=odd)
         doubted, plain, uneven = doubted.at(doubtful), part_of(plain, doubtful), uneven[doubtful]
         doubtful = doubtful[doubtful]
     again = solved_again(doubted, start, plain, uneven)
     answer = chosen(doubtful, again, plain)
-    return each(lambda old, new: old.index_copy(0, doubted.which, new), found._replace(trust=whole(found)), answer)
+    answer = each(lambda old, new: old.index_copy(0, doubted.which, new), found._replace(trust=whole(found)), answer)
+    return answer._replace(odd=odd)
 
 
 def unusual(reference: Reference, found: Solution, settings: Settings, usual: Tensor) -> Tensor | None:

@@ -41,8 +41,14 @@ def as_frame_mask(where: str, mask: object, size: tuple[int, int]) -> Tensor:
 def eroded(shown: Tensor, reach: int = AROUND) -> Tensor:
     """Pixels (H, W) with nothing that is not ``shown`` (H, W) within ``reach`` px in x and y. Beyond the border nothing
     is known to hide anything."""
-    hidden = F.max_pool2d((~shown).float()[None, None], 2 * reach + 1, 1, reach)
-    return hidden[0, 0] == 0
+    clear = F.pad(shown, (reach,) * 4, value=True)
+    for axis in (0, 1):
+        done = 1
+        while done < 2 * reach + 1:  # as many pixels side by side are known to be clear
+            step, size = min(done, 2 * reach + 1 - done), clear.shape[axis]
+            clear = clear.narrow(axis, 0, size - step) & clear.narrow(axis, step, size - step)
+            done += step
+    return clear
 
 
 def filled(image: Tensor, shown: Tensor | None) -> Tensor:
@@ -54,15 +60,17 @@ def filled(image: Tensor, shown: Tensor | None) -> Tensor:
     return torch.where(shown, image, mean)
 
 
-def seen_through(reference: Reference, shown: Tensor | None) -> Reference:
-    """The ``reference`` as a camera sees it that shows the scene where ``shown`` (H, W), by default everywhere."""
+def seen_through(reference: Reference, shown: Tensor | None, heed: Tensor | None = None) -> Reference:
+    """The ``reference`` as a camera sees it that shows the scene where ``shown`` (H, W), by default everywhere, to
+    those templates that ``heed`` (B,), by default all."""
     if shown is None:
-        return reference._replace(sight=None)
+        return reference._replace(sight=None, heed=None)
     grid = reference.grid
     row, column = (torch.arange(n, device=grid.box.device) * BLOCK + (BLOCK - 1) / 2 for n in grid.blocks)
     y, x = torch.meshgrid(row + grid.box[1, 0], column + grid.box[0, 0], indexing="ij")
     middles = torch.stack((x.flatten(), y.flatten(), torch.ones_like(x.flatten())))
-    return reference._replace(sight=Sight(shown, eroded(shown, REACH), eroded(shown, REACH + SLACK), middles))
+    sight = Sight(shown, eroded(shown, REACH), eroded(shown, REACH + SLACK), middles)
+    return reference._replace(sight=sight, heed=heed)
 
 
 def picked(clear: Tensor, warp: Tensor, points: Tensor) -> Tensor:
@@ -82,18 +90,25 @@ def solve(
     if sight is None:
         return engine(reference, image, start, settings, trust)
     which = torch.arange(len(start), device=start.device) if trust is None else trust.which
-    counted = picked(sight.well_clear, reference.warps(start), sight.middles)[which]
+    counted = in_sight(reference, start, sight.well_clear, sight.middles)[which]
     found = without(engine(reference, image, start, settings, trusted(which, counted, trust)), counted)
     if settings.max_iterations == 1:
         return found
     there = start.index_copy(0, which, found.pose)
-    clear = picked(sight.clear, reference.warps(there), sight.middles)[which]
+    clear = in_sight(reference, there, sight.clear, sight.middles)[which]
     right = (counted <= clear).all(1) & (counted.sum(1) >= FEW * clear.sum(1))
     if is_cpu(start.device) and bool(right.all()):
         return found
     clear = torch.where(right[:, None], counted, clear)
     again = without(engine(reference, image, there, settings, trusted(which, clear, trust)), clear)
     return each(lambda old, new: torch.where(right.view(-1, *[1] * (old.dim() - 1)), old, new), found, again)
+
+
+def in_sight(reference: Reference, pose: Tensor, clear: Tensor, middles: Tensor) -> Tensor:
+    """Which blocks with ``middles`` (3, blocks) of templates at ``pose`` (B, 3) see what is ``clear`` (H, W), or need
+    not: (B, blocks)."""
+    seen = picked(clear, reference.warps(pose), middles)
+    return seen if reference.heed is None else seen | ~reference.heed[:, None]
 
 
 def trusted(which: Tensor, clear: Tensor, trust: Trust | None) -> Trust | None:

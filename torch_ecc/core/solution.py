@@ -31,7 +31,8 @@ class Solution(NamedTuple):
     at the farthest pixel; ``iterations`` (B,); of the last look the patch's ``gain`` (B,), ``sums`` (B, 10, blocks), in
     every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 9) over the blocks, as they are trusted, with
     what the last three have in ``clustered``, and the ``normal`` equations of the pixels that count: in sight, and as
-    their blocks are trusted. A gain or total not finite is 0. ``trust`` (B, blocks) in these, None if it is whole."""
+    their blocks are trusted. A gain or total not finite is 0. ``trust`` (B, blocks) in these, None if it is whole;
+    ``odd`` (B,): which have blocks with more left than any noise leaves, None if it is known that none has."""
 
     pose: Tensor
     error: Tensor
@@ -41,6 +42,7 @@ class Solution(NamedTuple):
     total: Tensor
     normal: Normal
     trust: Tensor | None = None
+    odd: Tensor | None = None
 
 
 Engine = Callable[[Reference, Tensor, Tensor, Settings, Trust | None], Solution]  # ``solver.solve``, ``native.solve``

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -44,20 +44,26 @@ def beginning(start: Tensor) -> dict[str, Tensor]:
     }
 
 
-def remembering(state: State, image: Tensor, settings: Settings) -> Callable[[Reference, Tensor], Estimate]:
-    """How templates are found in an ``image``, from poses (R, 3) on, with what is known of them; what of them is
-    believed where there is a pose, is what the next look begins with."""
-    memory = Memory(state["score"], state["trust"])
+class Remembering:
+    """How templates are found in an ``image``, from poses (R, 3) on, with what is known of them in a ``state``; what of
+    them is believed where there is a pose, is what the next look begins with.
 
-    def look(reference: Reference, pose: Tensor) -> Estimate:
-        estimate, trust = solve_again(reference, image, pose, settings, state["start"], memory)
-        if trust is None:
+    ``odd``: which (R,) have blocks with more left than any noise leaves, None if it is known that none has."""
+
+    def __init__(self, state: State, image: Tensor, settings: Settings) -> None:
+        self.state, self.image, self.settings = state, image, settings
+        self.odd: Tensor | None = None
+
+    def __call__(self, reference: Reference, pose: Tensor) -> Estimate:
+        state = self.state
+        memory = Memory(state["score"], state["trust"])
+        estimate, found = solve_again(reference, self.image, pose, self.settings, state["start"], memory)
+        self.odd = found.odd
+        if found.trust is None:
             state["trust"].fill_(1)
         else:
-            state["trust"].copy_(torch.where(Status.good(estimate.status)[:, None], trust, 1.0))
+            state["trust"].copy_(torch.where(Status.good(estimate.status)[:, None], found.trust, 1.0))
         return estimate
-
-    return look
 
 
 def advanced(state: State, estimate: Estimate) -> Estimate:

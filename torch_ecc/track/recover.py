@@ -20,20 +20,18 @@ from torch_ecc.core.align import solve, solve_again
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import compose, rotation, unwrap
-from torch_ecc.core.pyramid import as_images
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import Memory
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
-from torch_ecc.core.verdict import expected_score, just_as_good, noise_share, unknown, within_margin
-from torch_ecc.search.correlation import about_mean
+from torch_ecc.core.verdict import expected_score, just_as_good, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, REACH, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
 from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.max_step import MaxStep
+from torch_ecc.track.textureless import least_contrast, textureless
 
-FLAT_NOISE, FLAT_TEXTURE = 1.5, 0.02  # of the variance of both: a frame that nowhere has more shows no template
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
 AT_ONCE = 4  # templates searched for in the whole of one frame; the others in turn
 KEPT = 2**25  # complex numbers prepared for searches of the whole frame, 256 MB
@@ -42,7 +40,6 @@ PATIENCE = 16  # frames in which a lost template is searched for at every chance
 SELDOM = 16  # frames between two searches for what has been lost for long
 ALIGNED, NEARBY_ALIGNED = 20_000_000, 1_000_000  # pixels that can be read while a search aligns what it has found
 KNOWN = 0.75 * REACH  # px: look-alikes of a place found near are known if it is not farther from the last one
-NOISE_ALONE = 1.3  # times as much noise in some direction as there may be: no place can be told from the next one
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
 COARSE = (8.0, ANGLE_STEP)  # px, rad: as finely as places are told apart before they are refined
 SLID = 16.0  # px beyond the last step: where something else was tracked, if it does not look as usual either
@@ -139,23 +136,6 @@ def familiar(found: Estimate, usual: Tensor) -> Tensor:
 def beats(found: Estimate, hand: Estimate) -> Tensor:
     """Whether ``found`` places (n, ...) are clearly better than those at ``hand``: bool (n,)."""
     return ~Status.good(hand.status) | ~within_margin(hand.score, found.score)
-
-
-def textureless(reference: Reference, settings: Settings) -> tuple[list[bool], list[bool]]:
-    """Templates (B,) that most frames as noisy as themselves find LOW_TEXTURE; and those of them that no search can
-    find: noise is all there is, in some direction, or so much that they would not know themselves again."""
-    share, expected = noise_share(reference, reference.normal), expected_score(reference)
-    hopeless = ~(share <= NOISE_ALONE) | ((share > 1) & (expected < settings.min_score))
-    return (~(share <= 1)).tolist(), hopeless.tolist()
-
-
-def least_contrast(reference: Reference) -> tuple[int, float]:
-    """A window's side, px, and the variance of grey levels in it that the least of the templates (B,) needs to show at
-    all: more than its noise leaves there."""
-    (image, kept, _), power = as_images(reference), reference.noise.of_frame
-    total = (kept * about_mean(image, kept).square()).sum((1, 2, 3)) / kept.sum((1, 2, 3))
-    least = FLAT_NOISE * power + FLAT_TEXTURE * (total - power).clamp(min=0)
-    return max(min(image.shape[-2:]) // 2, 2), float(least.amin())
 
 
 class Recovery:

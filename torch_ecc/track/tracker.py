@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Self
@@ -24,15 +23,17 @@ from torch_ecc.core.robust import Memory
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, seen_through
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator, image_pyramid
-from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, remembering, skipped
+from torch_ecc.track.advance import Remembering, advanced, advanced_in_doubt, beginning, check_prediction, skipped
 from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.coarse import coarse_to_fine
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
-from torch_ecc.track.sensor import dead_in, shown
+from torch_ecc.track.sensor import dead_in, kept, shown
 from torch_ecc.track.shutter import Shutter
+from torch_ecc.track.still import Watch, without_marks
+from torch_ecc.track.textureless import warn_of_textureless
 
 DERIVED = ("references", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
 
@@ -141,8 +142,8 @@ class Tracker(nn.Module):
     def _begin(self, gray: Tensor, patches: Patches) -> None:
         """The state before the first frame that is tracked."""
         templates, start = crop(gray, patches), torch.nn.functional.pad(patches.centers, (0, 1))
-        first = _kept(filled(gray, self.frame_mask))  # frame: what else in it looks like them?
-        past = self.shutter.beginning(start)
+        first = kept(filled(gray, self.frame_mask))  # frame: what else in it looks like them?
+        past = {**self.shutter.beginning(start), **Watch.begin(gray, start)._asdict()}
         for name, value in {**templates._asdict(), "first": first, **beginning(start), **past}.items():
             self.register_buffer(name, value)
         self._use(self._prepared(self._buffers))
@@ -152,7 +153,7 @@ class Tracker(nn.Module):
             for name, value in Lessons.begin(self.template, self.references[0].noise.level, start).items():
                 self.register_buffer(name, value)
             self._use([told(self.references[0], self._buffers), *self.references[1:]])
-        _warn_of_textureless(self._recovery.textureless)
+        warn_of_textureless(self._recovery.textureless)
 
     @classmethod
     @plain
@@ -176,15 +177,22 @@ class Tracker(nn.Module):
         tracker._use(tracker.references)
         settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
-        tracker.register_buffer("first", _kept(filled(view, tracker.frame_mask)))
+        tracker.register_buffer("first", kept(filled(view, tracker.frame_mask)))
         tracker.shutter.check(view.shape[2])
         begun(tracker._buffers, located.pose)
+        for name, value in Watch.begin(view, tracker.start)._asdict().items():
+            tracker.register_buffer(name, value)
         return tracker, located
 
     @property
     def learns(self) -> bool:
         """Whether its templates may become others."""
         return self.rounds != (1, 0)
+
+    @property
+    def watches(self) -> bool:
+        """Whether it looks for marks of its camera, ``track.still``: one that exposes all rows at once."""
+        return self.frame_mask is None and self.frame_shape[0] == 1 and self.shutter.line == 0
 
     def _prepared(self, state: Mapping[str, Tensor]) -> list[Reference]:
         """Every level of the templates in a ``state``."""
@@ -197,13 +205,15 @@ class Tracker(nn.Module):
 
     def _use(self, references: list[Reference]) -> None:
         """Goes on with ``references``, in what the camera shows."""
-        self.references = [seen_through(references[0], self.frame_mask), *references[1:]]
+        watch, first = Watch.of(self._buffers), seen_through(references[0], self.frame_mask)
+        self.references = [watch.seen(first, self.start) if self.watches else first, *references[1:]]
         budget = Budget(self.credit, self.turn, math.prod(self.frame_shape), self.template.numel())
         self._recovery = Recovery(self.references[0], self.settings, budget, self.max_step)
         alone = len(self.start) == 1 or self.frame_shape[0] > 1
         self._crowd = None if alone else Crowd(self.start[:, :2])
+        sight = self.references[0].sight
         if self.learns:
-            self._teacher = Teacher(self.criterion, self.settings.interpolation, self.rounds, self.frame_mask)
+            self._teacher = Teacher(self.criterion, self.settings.interpolation, self.rounds, sight and sight.shown)
             self._version = self.template._version
 
     def _learned(self, image: Tensor, estimate: Estimate, suspects: list[bool]) -> Estimate:
@@ -305,8 +315,12 @@ class Tracker(nn.Module):
         start = ahead(state["pose"], state["velocity"]) if self.prediction == "velocity" else state["pose"]
         images = [image.detach()]
         self._recovery.budget.earn(self.income)
-        estimate = self._within_reach(self._solve(image, images, start))
-        past = Past.of(state)
+        look, estimate = self._solve(image, images, start)
+        if self.watches:
+            estimate, marked = without_marks(self.references[0], images[0], look, estimate, start)
+            if marked:
+                self._use(self.references)
+        estimate, past = self._within_reach(estimate), Past.of(state)
         if self.search:
             estimate = self._recovery.not_led_away(estimate, start, past)
         doubtful = any(suspect(estimate, state["score"]))
@@ -372,27 +386,14 @@ class Tracker(nn.Module):
             raise ValueError("track_sequence: frames must hold at least one frame, got none")
         return Track.stack(estimates)
 
-    def _solve(self, image: Tensor, images: list[Tensor], pose: Tensor) -> Estimate:
+    def _solve(self, image: Tensor, images: list[Tensor], pose: Tensor) -> tuple[Remembering, Estimate]:
         """Coarse to fine; ``images`` holds the ``image`` without gradients and grows to as many levels as there are."""
         if self.levels > 1:
             image = filled(image.float(), self.frame_mask)
             images[:] = image_pyramid(image.detach(), self.levels)
             pose = coarse_to_fine(self.references, images, pose, self.settings.max_iterations)
-        look = remembering(self._buffers, image, self.settings)
-        return self.shutter.solve(look, self.references[0], pose, self._buffers, self.settings.tolerance)
-
-
-def _kept(frame: Tensor) -> Tensor:
-    """A frame (1 or R, 1, H, W) in half the memory, good enough to look for look-alikes in: float16 about its mean."""
-    gray = frame - frame.mean((2, 3), keepdim=True)
-    return (gray / gray.square().mean((2, 3), keepdim=True).sqrt().clamp(min=1e-30)).clamp(-1e4, 1e4).half()
-
-
-def _warn_of_textureless(each: list[bool]) -> None:
-    which = [r for r, textureless in enumerate(each) if textureless]
-    if which:
-        names = f"template {which[0]}" if len(which) == 1 else f"templates {', '.join(map(str, which))}"
-        warnings.warn(f"Tracker: {names}: {Status.describe(Status.LOW_TEXTURE)}", stacklevel=7)
+        look = Remembering(self._buffers, image, self.settings)
+        return look, self.shutter.solve(look, self.references[0], pose, self._buffers, self.settings.tolerance)
 
 
 def _words(shape: tuple[int, ...]) -> str:

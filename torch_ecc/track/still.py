@@ -1,0 +1,337 @@
+"""Marks of the camera that nobody has told of (aperture, stripe, dust), and still background in a template: they stay
+as they were in the first frame while the template moves.
+
+Of a frame of which a template leaves more than noise does, every pixel has two explanations: it shows the template
+where that is now, or what it showed in the first frame. Where the second one holds to within noise, and the first one
+clearly does not, there is a mark: the pixel tells nothing of the template, nor does what the template was there.
+
+A mark bends the very pose that it is told from. If what it then seems to be does not let the rest fit, all that shows
+texture and stands still is left out once, and the mark is told from the pose that the rest has. Nothing is taken for a
+mark unless the template fits without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torch_ecc.core.align import solve_again
+from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.normal import LEAST
+from torch_ecc.core.pose import turn
+from torch_ecc.core.reference import Reference, each, reweigh
+from torch_ecc.core.robust import LEAST_NOISE, Memory, unusual
+from torch_ecc.core.sampling import Sampler, inside, noise_level
+from torch_ecc.core.settings import Settings
+from torch_ecc.core.sight import eroded, picked, seen_through
+from torch_ecc.core.verdict import expected_score, within_margin
+from torch_ecc.search.locate import pose_distance
+from torch_ecc.track.advance import Remembering
+from torch_ecc.track.frame_mask import unexplained
+
+AROUND = 3  # px: pixels are compared in squares of so many
+STILL = 3.0  # times the noise of a difference: so much is left of squares that stand still
+EXCESS = 9.0  # times it, and
+CONTRAST = 0.2  # of the template's, must be left by the template, which light and the sampler do not leave
+BELIEVED = 0.95  # of what is in sight must fit without the marks
+ELSEWHERE = 2.0  # px, of its farthest pixel: what fits there has no mark in it that one does not know of
+FARTHER = 1.5  # times as far one looks again
+BY_CHANCE = 3.0  # standard deviations of what noise may leave
+QUIET, TO_MEAN = 0.3, 1.41  # a quantile of what noise leaves of squares, and their mean over it
+ROUNDS = 3  # in which they are told from poses that they bend less and less
+
+State = Mapping[str, Tensor]
+
+
+class Look(NamedTuple):
+    """Pixels (h, w) of a frame from ``corner`` (y, x) on, around one template. Variances over AROUND px: how much has
+    ``changed`` since the first frame, and what the template has ``left`` unexplained here, or where what was here in
+    the first frame is now, 0 where it says nothing; of the first frame, its ``texture``; ``noise`` of a difference of
+    two frames, and ``contrast`` of the template."""
+
+    corner: tuple[int, int]
+    changed: Tensor
+    left: Tensor
+    texture: Tensor
+    noise: float
+    contrast: float
+
+    @property
+    def still(self) -> Tensor:
+        """All that stands still, and shows it (h, w)."""
+        return (self.changed < STILL * self.noise) & (self.texture > CONTRAST**2 * self.contrast)
+
+    @property
+    def marks(self) -> Tensor:
+        """What stands still and should not (h, w)."""
+        most = max(EXCESS * self.noise, CONTRAST**2 * self.contrast)
+        return (self.changed < STILL * self.noise) & (self.left > most)
+
+    @property
+    def shift(self) -> Tensor:
+        """From the frame's first pixel to this one: (2, 3), to be taken from warps."""
+        y, x = self.corner
+        return torch.tensor([[0, 0, x], [0, 0, y]], dtype=torch.float64)
+
+    def within(self, part: Tensor, like: Tensor) -> Tensor:
+        """A ``part`` (h, w) of it as one of a frame ``like`` (H, W)."""
+        whole, (y, x) = torch.zeros_like(like, dtype=torch.bool), self.corner
+        whole[y : y + part.shape[0], x : x + part.shape[1]] = part
+        return whole
+
+
+def look(still: Still, pose: Tensor, clean: Reference) -> Look:
+    """At one template at a ``pose`` (1, 3), which is ``clean`` of marks as far as one knows."""
+    reference, (height, width) = still.reference, still.shown.shape
+    warps = reference.warps(torch.cat((pose, still.home)))
+    x, y = (warps @ reference.grid.box.to(warps.dtype)).round().long().unbind(1)
+    x0, x1, y0, y1 = (*span(x, width), *span(y, height))
+    view, before = still.image[0, 0, y0:y1, x0:x1].float(), still.first[y0:y1, x0:x1].float()
+    before = before * still.level[1] + still.level[0]
+    now, home = (W - torch.cat((torch.zeros(2, 2), torch.tensor([[x0], [y0]])), 1).to(W) for W in warps)
+    pixels = homogeneous(view)
+    expected, known = projected(reference, now, pixels, (y1 - y0, x1 - x0))
+    known &= still.shown[y0:y1, x0:x1]
+    left = unexplained(view[None], torch.where(known, expected, torch.nan)[None], expected[None])[0]
+    left = mean(torch.where(known, left, 0.0).square())
+    contrast = float(clean.normal.energy / clean.normal.total)
+    noise = 2 * max(float(reference.noise.of_frame), LEAST_NOISE**2 * contrast)
+    changed = mean((view - before).square())
+    new = torch.where(changed < STILL * noise, 0.0, left)  # else a mark may have come to be there
+    since = composed(now, inverted(home))[None]  # from where a pixel was to where that is now
+    own = torch.where(inside(since, pixels, view.shape), picked(new, since, pixels), 0.0).view(view.shape)
+    texture = mean(before.square()) - mean(before).square()
+    return Look((y0, x0), changed, left if still.pure else left.maximum(own), texture, noise, contrast)
+
+
+def span(places: Tensor, size: int) -> tuple[int, int]:
+    """The first pixel, and that after the last one, of those (n,) in a row of ``size``."""
+    return int(places.min().clamp(0, size - 1)), int(places.max().clamp(0, size - 1)) + 1
+
+
+def homogeneous(view: Tensor) -> Tensor:
+    """The pixels (3, h w) of a ``view`` (h, w), from its first one on."""
+    y, x = torch.meshgrid(*(torch.arange(n, device=view.device, dtype=view.dtype) for n in view.shape), indexing="ij")
+    return torch.stack((x.flatten(), y.flatten(), torch.ones_like(x.flatten())))
+
+
+def inverted(warp: Tensor) -> Tensor:
+    """Of a ``warp`` (2, 3)."""
+    turn = torch.linalg.inv(warp[:, :2])
+    return torch.cat((turn, -turn @ warp[:, 2:]), 1)
+
+
+def composed(outer: Tensor, inner: Tensor) -> Tensor:
+    """Warps (2, 3): first the ``inner`` one."""
+    return torch.cat((outer[:, :2] @ inner[:, :2], outer[:, :2] @ inner[:, 2:] + outer[:, 2:]), 1)
+
+
+def projected(reference: Reference, warp: Tensor, pixels: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """One template as the ``warp`` (2, 3) puts it into a view of ``size`` (h, w) with these ``pixels`` (3, h w), and
+    where it counts there, bool."""
+    (image, weight), back = images(reference), inverted(warp)
+    back = torch.cat((back[:, :2], back[:, 2:] - reference.grid.box[:2, :1].to(back)), 1)[None]
+    known = picked(weight[0, 0] > 0, back, pixels) & inside(back, pixels, image.shape[2:])
+    return Sampler.of(image, "bspline3")(back, pixels).view(size), known.view(size)
+
+
+def images(reference: Reference) -> tuple[Tensor, Tensor]:
+    """The templates, and their weights, as images (B, 1, h, w) with 0 where no pixel counts."""
+    grid = reference.grid
+    column, row = (grid.pixels[:2] - grid.box[:2, :1]).long()
+    both = torch.stack((reference.signal[:, 3], reference.weight)).detach()
+    whole = both.new_zeros(2, both.shape[1], 1, *(int(n) for n in grid.sides.flip(0).tolist()))
+    whole[:, :, 0, row, column] = both
+    return whole[0], whole[1]
+
+
+def mean(image: Tensor) -> Tensor:
+    """Over squares of AROUND px, (h, w)."""
+    return F.avg_pool2d(image[None, None], AROUND, 1, AROUND // 2, count_include_pad=False)[0, 0]
+
+
+def behind(reference: Reference, home: Tensor, marks: Tensor, which: Tensor) -> Reference:
+    """The templates, cut at ``home`` (B, 3), as a camera sees them that has ``marks`` (H, W), bool: those of them at
+    ``which`` (B,) that heed them, in the frame and in what they were cut from."""
+    if not bool(which.any()):
+        return reference
+    shown, index = ~marks, which.nonzero()[:, 0]
+    clear = eroded(shown)
+
+    def without(part: Reference) -> Reference:
+        return reweigh(part, picked(clear, part.warps(home[index]), part.grid.pixels))
+
+    some = reference._replace(sight=None, heed=None).select(index)
+    coarse = None if some.coarse is None else without(some.coarse)
+    some = without(some)
+    level = noise_level(*images(some)).maximum(some.noise.level)  # dark marks have less of it
+    some = some._replace(coarse=coarse, noise=some.noise._replace(level=level, power=level.to(home).square()))
+    if len(index) < len(which):
+        whole = reference._replace(sight=None, heed=None)
+        some = each(lambda old, new: old.index_copy(0, index, new), whole, some)
+    return seen_through(some, shown, None if len(index) == len(which) else which)
+
+
+class Trial(NamedTuple):
+    """One template without marks: the ``estimate`` (1, ...), whether it leaves ``odd`` blocks, the ``reference``, and
+    what is ``shown`` (H, W)."""
+
+    estimate: Estimate
+    odd: bool
+    reference: Reference
+    shown: Tensor
+
+    @property
+    def fits(self) -> bool:
+        """Whether what is left of it does."""
+        e = self.estimate
+        known = within_margin(e.score, expected_score(self.reference)) & (e.coverage > BELIEVED)
+        return not self.odd and bool(known & (e.status == Status.CONVERGED))
+
+
+class Still(NamedTuple):
+    """One template in one ``image`` (1, 1, H, W), expected at ``start`` (1, 3) after it was at ``home`` (1, 3) in the
+    ``first`` one (H, W), known as so many standard deviations about a mean, its ``level`` (2,); where the camera has
+    ``shown`` (H, W) the scene, as far as one knows; ``pure``: it has been seen elsewhere as it is, so no mark is in it.
+    """
+
+    reference: Reference
+    image: Tensor
+    first: Tensor
+    level: Tensor
+    start: Tensor
+    home: Tensor
+    shown: Tensor
+    pure: bool
+    settings: Settings
+
+    def trial(self, shown: Tensor) -> Trial | None:
+        """With less that is ``shown``; None if hardly anything is left of it."""
+        reference = behind(self.reference, self.home, ~shown, torch.ones_like(self.home[:, 0], dtype=torch.bool))
+        if not bool(reference.normal.total > LEAST):
+            return None
+        memory = Memory.none(reference)
+        found, solution = solve_again(
+            reference, self.image, self.start, replace(self.settings, robust=False), self.home, memory
+        )
+        odd = bool(unusual(reference, solution, self.settings, memory.score))
+        return Trial(found, odd, reference, shown)
+
+    def told(self, pose: Tensor, clean: Reference) -> Trial | None:
+        """Without the marks that are told from a ``pose`` (1, 3) on, and a template that is ``clean`` of them as far as
+        one knows; None if it then does not fit."""
+        for _ in range(ROUNDS):
+            seen = look(self, pose, clean)
+            marks = seen.within(seen.marks, self.shown) & self.shown
+            trial = self.trial(self.shown & ~marks) if bool(marks.any()) else None
+            if trial is None or trial.fits:
+                return trial
+            if not Status.good(trial.estimate.status):
+                return None
+            pose, clean = trial.estimate.pose, trial.reference
+        return None
+
+    def without_marks(self, pose: Tensor) -> Trial | None:
+        """What it is without them, as told from a ``pose`` (1, 3) that they may bend; None if there are none, or one
+        cannot tell."""
+        trial = self.told(pose, self.reference)
+        if trial is not None or self.pure:
+            return trial
+        seen = look(self, pose, self.reference)
+        trial = self.trial(self.shown & ~seen.within(seen.still, self.shown))
+        if trial is None or not Status.good(trial.estimate.status):
+            return None
+        return self.told(trial.estimate.pose, trial.reference)
+
+    def doubt(self, pose: Tensor, trusted: Tensor) -> Tensor:
+        """By what (1, 3, 3) it may be off at a ``pose`` (1, 3) if all that stands still is no part of it: a covariance
+        of as much as leaves what is left of the others in blocks that are ``trusted`` (1, blocks), and more than noise.
+        """
+        seen, reference, axes = look(self, pose, self.reference), self.reference, turn(pose[:, 2])
+        now, home = reference.warps(torch.cat((pose, self.home))).sub_(seen.shift).split(1)
+        pixels, size = reference.grid.pixels, seen.left.shape
+        frozen = picked(seen.still, now, pixels) | picked(seen.still, home, pixels)
+        moving = inside(now, pixels, size) & ~frozen & (trusted[:, reference.grid.block] == 1)
+        left = picked(seen.left, now, pixels)[moving]
+        if len(left) == 0:
+            return torch.zeros_like(axes)
+        noise = left.quantile(QUIET).mul(TO_MEAN).clamp(max=seen.noise)  # the estimate is an upper one
+        more = (left - noise).sum() - BY_CHANCE * noise * (2 * len(left)) ** 0.5
+        spread: Tensor = reweigh(reference, moving).normal.inverse[:, :3, :3] * more.clamp(min=0)
+        doubt: Tensor = axes @ (spread + spread.mT) @ axes.mT / 2
+        return doubt
+
+
+class Watch(NamedTuple):
+    """What a tracker's state holds of R templates: the ``marks`` (H, W) of the camera, and which of them ``heed`` (R,)
+    these, 0 or 1 each; for how many frames (R,) more was left of them than noise leaves, and ``no_mark`` was found; how
+    ``far`` (R,) px from their places in the first frame one has looked in vain; where they were, ``fitted`` (R, 3),
+    when last no more was left than noise; and the first frame's ``level`` (2,), mean and standard deviation in grey
+    levels."""
+
+    marks: Tensor
+    heed: Tensor
+    no_mark: Tensor
+    far: Tensor
+    fitted: Tensor
+    level: Tensor
+
+    @staticmethod
+    def begin(frame: Tensor, start: Tensor) -> Watch:
+        """Of templates at ``start`` (R, 3) in a ``frame`` (1 or R, 1, H, W)."""
+        none = torch.zeros_like(start[:, 0])
+        level = torch.stack((frame.mean(), frame.var(correction=0).sqrt()))
+        marks = torch.zeros_like(frame[0, 0], dtype=torch.uint8)
+        return Watch(marks, none.to(torch.uint8), none.long(), none, start.clone(), level)
+
+    @staticmethod
+    def of(state: State) -> Watch:
+        """From a tracker's buffers."""
+        return Watch(*(state[name] for name in Watch._fields))
+
+    def seen(self, reference: Reference, home: Tensor) -> Reference:
+        """The templates, cut at ``home`` (R, 3), through a camera with these marks."""
+        return behind(reference, home, self.marks > 0, self.heed > 0)
+
+    def due(self, odd: Tensor, moved: Tensor) -> list[int]:
+        """Which of the templates that leave more than noise does, ``odd`` (R,) bool, and have ``moved`` (R,) px, to
+        look at: more and more seldom if there is nothing to find, but again farther off."""
+        each_one = zip(odd.tolist(), self.no_mark.tolist(), moved.tolist(), self.far.tolist(), strict=True)
+        self.no_mark.add_(odd)
+        return [r for r, (o, n, d, f) in enumerate(each_one) if o and (n & (n - 1) == 0 or d > FARTHER * f + AROUND)]
+
+
+def without_marks(
+    reference: Reference, image: Tensor, look: Remembering, estimate: Estimate, start: Tensor
+) -> tuple[Estimate, bool]:
+    """The ``estimate`` of R templates in an ``image`` (1, 1, H, W), as one ``look`` from the ``start`` (R, 3) on has
+    made it, without the marks that it shows; and whether there are new ones, in the state."""
+    state, watch, odd = look.state, Watch.of(look.state), look.odd
+    if odd is None:
+        watch.fitted.copy_(estimate.pose)
+        return estimate, False
+    watch.fitted.copy_(torch.where(odd[:, None], watch.fitted, estimate.pose))
+    radius, found = reference.place.radius, False
+    moved, fitted = (pose_distance(pose, state["start"], radius=radius) for pose in (estimate.pose, watch.fitted))
+    pure = ((fitted > ELSEWHERE) & (watch.heed == 0)).tolist()
+    for r in watch.due(odd, moved):
+        at = torch.tensor([r], device=start.device)
+        alone = reference._replace(sight=None, heed=None).select(at)
+        first, home = state["first"][0, 0], state["start"][at]
+        still = Still(alone, image, first, watch.level, start[at], home, watch.marks == 0, pure[r], look.settings)
+        trial = still.without_marks(estimate.pose[at])
+        if trial is None:
+            watch.far[r] = moved[r].maximum(watch.far[r])
+            if not pure[r] and bool(Status.good(estimate.status[at])):
+                estimate.covariance[at] += still.doubt(estimate.pose[at], state["trust"][at])
+            continue
+        estimate, found = estimate.put(at, trial.estimate), True
+        watch.marks.copy_(~trial.shown)
+        watch.heed[r], watch.no_mark[r], watch.far[r] = 1, 0, 0
+        state["score"][r], state["trust"][r] = expected_score(trial.reference)[0], 1
+    return estimate, found
