@@ -39,6 +39,7 @@ STILL = 3.0  # times the noise of a difference: so much is left of squares that 
 EXCESS = 9.0  # times it, and
 CONTRAST = 0.2  # of the template's, must be left by the template, which light and the sampler do not leave
 BELIEVED = 0.95  # of what is in sight must fit without the marks
+ELSEWHERE = 2.0  # px, of its farthest pixel: what fits there has no mark in it that one does not know of
 FARTHER = 1.5  # times as far one looks again
 BY_CHANCE = 3.0  # standard deviations of what noise may leave
 QUIET, TO_MEAN = 0.3, 1.41  # a quantile of what noise leaves of squares, and their mean over it
@@ -105,7 +106,7 @@ def look(still: Still, pose: Tensor, clean: Reference) -> Look:
     since = composed(now, inverted(home))[None]  # from where a pixel was to where that is now
     own = torch.where(inside(since, pixels, view.shape), picked(new, since, pixels), 0.0).view(view.shape)
     texture = mean(before.square()) - mean(before).square()
-    return Look((y0, x0), changed, left.maximum(own), texture, noise, contrast)
+    return Look((y0, x0), changed, left if still.pure else left.maximum(own), texture, noise, contrast)
 
 
 def span(places: Tensor, size: int) -> tuple[int, int]:
@@ -196,7 +197,8 @@ class Trial(NamedTuple):
 class Still(NamedTuple):
     """One template in one ``image`` (1, 1, H, W), expected at ``start`` (1, 3) after it was at ``home`` (1, 3) in the
     ``first`` one (H, W), known as so many standard deviations about a mean, its ``level`` (2,); where the camera has
-    ``shown`` (H, W) the scene, as far as one knows."""
+    ``shown`` (H, W) the scene, as far as one knows; ``pure``: it has been seen elsewhere as it is, so no mark is in it.
+    """
 
     reference: Reference
     image: Tensor
@@ -205,6 +207,7 @@ class Still(NamedTuple):
     start: Tensor
     home: Tensor
     shown: Tensor
+    pure: bool
     settings: Settings
 
     def trial(self, shown: Tensor) -> Trial | None:
@@ -237,7 +240,7 @@ class Still(NamedTuple):
         """What it is without them, as told from a ``pose`` (1, 3) that they may bend; None if there are none, or one
         cannot tell."""
         trial = self.told(pose, self.reference)
-        if trial is not None:
+        if trial is not None or self.pure:
             return trial
         seen = look(self, pose, self.reference)
         trial = self.trial(self.shown & ~seen.within(seen.still, self.shown))
@@ -267,13 +270,15 @@ class Still(NamedTuple):
 class Watch(NamedTuple):
     """What a tracker's state holds of R templates: the ``marks`` (H, W) of the camera, and which of them ``heed`` (R,)
     these, 0 or 1 each; for how many frames (R,) more was left of them than noise leaves, and ``no_mark`` was found; how
-    ``far`` (R,) px from their places in the first frame one has looked in vain; and that frame's ``level`` (2,), mean
-    and standard deviation in grey levels."""
+    ``far`` (R,) px from their places in the first frame one has looked in vain; where they were, ``fitted`` (R, 3),
+    when last no more was left than noise; and the first frame's ``level`` (2,), mean and standard deviation in grey
+    levels."""
 
     marks: Tensor
     heed: Tensor
     no_mark: Tensor
     far: Tensor
+    fitted: Tensor
     level: Tensor
 
     @staticmethod
@@ -281,7 +286,8 @@ class Watch(NamedTuple):
         """Of templates at ``start`` (R, 3) in a ``frame`` (1 or R, 1, H, W)."""
         none = torch.zeros_like(start[:, 0])
         level = torch.stack((frame.mean(), frame.var(correction=0).sqrt()))
-        return Watch(torch.zeros_like(frame[0, 0], dtype=torch.uint8), none.to(torch.uint8), none.long(), none, level)
+        marks = torch.zeros_like(frame[0, 0], dtype=torch.uint8)
+        return Watch(marks, none.to(torch.uint8), none.long(), none, start.clone(), level)
 
     @staticmethod
     def of(state: State) -> Watch:
@@ -301,24 +307,30 @@ class Watch(NamedTuple):
 
 
 def without_marks(
-    tracker: TrackersLook, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor
+    tracker: TrackersLook, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor | None
 ) -> tuple[Estimate, bool]:
     """The ``estimate`` of R templates of a ``tracker`` in an ``image`` (1, 1, H, W), from the ``start`` (R, 3) on,
-    without the marks that it shows where there is more left than any noise leaves, ``odd`` (R,) bool; and whether there
-    are new ones, in the state."""
+    without the marks that it shows where there is more left than any noise leaves, ``odd`` (R,) bool, None if it is
+    known that there is none; and whether there are new ones, in the state."""
     state, reference = tracker.state, tracker.references[0]
     watch = Watch.of(state)
-    moved, found = pose_distance(estimate.pose, state["start"], radius=reference.place.radius), False
+    if odd is None:
+        watch.fitted.copy_(estimate.pose)
+        return estimate, False
+    watch.fitted.copy_(torch.where(odd[:, None], watch.fitted, estimate.pose))
+    radius, found = reference.place.radius, False
+    moved, fitted = (pose_distance(pose, state["start"], radius=radius) for pose in (estimate.pose, watch.fitted))
+    pure = ((fitted > ELSEWHERE) & (watch.heed == 0)).tolist()
     for r in watch.due(odd, moved):
         at = torch.tensor([r], device=start.device)
         alone = reference._replace(sight=None, heed=None).select(at)
         first, home = state["first"][0, 0], state["start"][at]
-        still = Still(alone, image, first, watch.level, start[at], home, watch.marks == 0, tracker.settings)
+        still = Still(alone, image, first, watch.level, start[at], home, watch.marks == 0, pure[r], tracker.settings)
         trial = still.without_marks(estimate.pose[at])
         if trial is None:
             watch.far[r] = moved[r].maximum(watch.far[r])
-            doubt = still.doubt(estimate.pose[at], state["trust"][at])
-            estimate.covariance[at] += torch.where(Status.good(estimate.status[at])[:, None, None], doubt, 0.0)
+            if not pure[r] and bool(Status.good(estimate.status[at])):
+                estimate.covariance[at] += still.doubt(estimate.pose[at], state["trust"][at])
             continue
         estimate, found = estimate.put(at, trial.estimate), True
         watch.marks.copy_(~trial.shown)

@@ -181,6 +181,8 @@ class Tracker(nn.Module):
         tracker.register_buffer("first", kept(filled(view, tracker.frame_mask)))
         tracker.shutter.check(view.shape[2])
         begun(tracker._buffers, located.pose)
+        for name, value in Watch.begin(view, tracker.start)._asdict().items():
+            tracker.register_buffer(name, value)
         return tracker, located
 
     @property
@@ -316,7 +318,7 @@ class Tracker(nn.Module):
         images = [image.detach()]
         self._recovery.budget.earn(self.income)
         start, estimate, odd = self._look(image, images)
-        if self.watches and odd is not None:
+        if self.watches:
             estimate, marked = without_marks(self._look, images[0], estimate, start, odd)
             if marked:
                 self._use(self.references)
