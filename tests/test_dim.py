@@ -11,6 +11,7 @@ from torch import Tensor
 import torch_ecc as te
 from torch_ecc import Reason, Status
 from torch_ecc.core.sampling import blur
+from torch_ecc.sim import micrograph
 
 SIZE, SIDE, MOVED = 151, 200, (1.4, -0.6)
 
@@ -85,3 +86,13 @@ def test_grain_along_an_edge_is_no_texture(dark, spread, size):
 def test_noise_of_any_size_is_no_texture(size):
     grain = torch.full((size + 40, size + 40), 100.0)
     assert te.texture(frame(grain, 5.0, size), [((size + 39) / 2,) * 2], size).isinf().all()
+
+
+def test_a_blurred_picture_is_no_noise():
+    """It answers every push less, but in one direction no less than in another."""
+    pose = torch.tensor([[100.0, 100.0, 0.0]], dtype=torch.float64)
+    sharp = micrograph(0).render(pose, (SIDE, SIDE))
+    tracker = te.Tracker(frame(sharp[0, 0], 2, 0), [(100.0, 100.0)], 121, search=False)
+    found = tracker(frame(blur(sharp, 4.0)[0, 0], 2, 1))
+    assert found.status == Status.CONVERGED
+    assert (found.displacement / found.sigma).abs().max() < 5
