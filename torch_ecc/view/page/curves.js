@@ -162,7 +162,8 @@ export class Curves extends EventTarget {
     context.strokeStyle = css("--line");
     context.lineWidth = 1;
     context.textAlign = "right";
-    const step = nice((range[1] - range[0]) / Math.max((plot.bottom - plot.top) / 30, 1.2));
+    let step = nice((range[1] - range[0]) / Math.max((plot.bottom - plot.top) / 30, 1.2));
+    while (Math.floor(range[1] / step) <= Math.ceil(range[0] / step)) step = nice(step / 2.5); // one line has no scale
     for (let v = Math.ceil(range[0] / step) * step; v <= range[1]; v += step) {
       context.beginPath();
       context.moveTo(plot.left, y(v));
