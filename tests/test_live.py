@@ -100,7 +100,7 @@ def test_the_test_camera_keeps_its_beat_and_its_word():
 @pytest.mark.parametrize(
     ("address", "words"),
     [
-        ("camera:", "KIND one of opencv, micromanager, basler, test, got 'camera:'"),
+        ("camera:", "KIND one of opencv, micromanager, basler, aravis, test, got 'camera:'"),
         ("camera:fax:1", "KIND one of opencv"),
         ("camera:opencv:front", "index must be 0 or more, got front"),
         ("camera:test:big", "a test camera is WIDTHxHEIGHT@HZ, got 'big'"),
@@ -322,3 +322,21 @@ def test_a_basler_camera_is_tracked(monkeypatch, tmp_path):
     assert all(a.number < b.number for a, b in itertools.pairwise(frames))
     with pytest.raises(ValueError, match="no Basler camera 12345 can be opened"):
         open_frames("camera:basler:12345")
+
+
+def test_an_aravis_camera_is_tracked():
+    """Aravis's own fake camera, whose ramp moves: frames come in order, none of which another one overwrites."""
+    pytest.importorskip("gi", reason="no PyGObject: pip install 'torch-ecc[aravis]'")
+    try:
+        source = open_frames("camera:aravis:Fake_1")[:12]
+    except ValueError as error:
+        pytest.skip(str(error))  # the library itself comes with the system
+    frames = list(source)
+    assert source.shape == (512, 512)
+    assert 0 < len(frames) <= 12
+    assert all(a.number < b.number and a.time_s < b.time_s for a, b in itertools.pairwise(frames))
+    ramps = np.stack([frame.pixels[0].numpy() for frame in frames]).astype(int)
+    moved = [(b - a) % 256 for a, b in itertools.pairwise(ramps)]
+    assert all((step == step[0]).mean() > 0.9 and step[0] != 0 for step in moved)
+    with pytest.raises(ValueError, match="no GenICam camera nobody can be opened"):
+        open_frames("camera:aravis:nobody")

@@ -16,6 +16,7 @@ KINDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
         "opencv": ("open_opencv", ""),
         "micromanager": ("open_micromanager", "micromanager"),
         "basler": ("open_basler", "basler"),
+        "aravis": ("open_aravis", "aravis"),
         "test": ("open_test", ""),
     }
 )

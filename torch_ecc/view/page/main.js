@@ -369,7 +369,7 @@ async function renderMap() {
   $("#legend").hidden = false;
   const [best, worst] = $("#legend").querySelectorAll("span");
   best.textContent = `σ ${brief(Math.exp(low))} px`;
-  worst.textContent = `${brief(Math.exp(high))} px; darkest: none`;
+  worst.textContent = `${brief(Math.exp(high))} px; darkest: no texture`;
   $("#legend i").style.background = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map((t) => `rgb(${heat(t)})`)})`;
 }
 
