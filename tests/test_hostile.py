@@ -17,6 +17,7 @@ import hostile
 import soak
 from films import covers, disturbed, repeats
 from films.shot import SCENES, Film, Shot, eq11, frames, visible_bound
+from films.soak import Moment
 from results import load
 
 from torch_ecc import Status
@@ -128,3 +129,12 @@ def test_a_soak_can_begin_anew_from_a_state(tmp_path: Path, monkeypatch: pytest.
     truth = [soak.figures(soak.Soak.of("waves", 0, (0, 80), 61).run()[0][k:])["converged"] for k in (0, 1)]
     assert f"converged {truth[0]}," in found[0][1]
     assert f"converged {truth[1]}," in found[1][0]
+
+
+def test_what_most_of_a_template_recognises_is_believed() -> None:
+    """Half of the blocks are touched by a strip that stands still, so that the median fits no better than least squares
+    does: what is left looks like the template."""
+    still = soak.Soak.of("pads", 4, (0, 80), 61)
+    run = still.part(1, [Moment(n % 40, "cover" if n > 5 else "clean", 0.2) for n in range(1, 80)])
+    assert not bool((run.wrong & run.believed).any())
+    assert int((run.status > Status.MAX_ITERATIONS).sum()) <= 25

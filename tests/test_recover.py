@@ -18,7 +18,8 @@ from torch_ecc.sim.scene.scene import PlaneWaves
 from torch_ecc.track.advance import FARTHEST, beginning, coast
 from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.recover import Past, Recovery, common_motion, gone_together
+from torch_ecc.track.recover import Past, Recovery, strained
+from torch_ecc.track.together import common_motion, gone_together
 
 FRAME = (240, 320)
 Y, X = np.mgrid[0 : FRAME[0], 0 : FRAME[1]].astype(float)
@@ -371,6 +372,16 @@ def test_searches_take_no_more_than_their_share(monkeypatch):
         counts[share] = len(searched)
         assert (te.Reason.WAITING in reasons) == (share < 1)
     assert counts[0.1] < counts[0.5] < counts[1.0]
+
+
+def test_what_is_much_like_a_template_but_another_thing_is_strained():
+    """Noise in the frame makes sigma as large as it should be; residuals that cling together much larger."""
+    stack = still((0, 0, 0), (3, 2, 1))
+    tracker = Tracker(noisy(stack[0].numpy(), np.random.default_rng(0)), [(160.0, 120.0)], 61)
+    for noise in (0, 2, 8):
+        estimate = tracker((stack[1] + noise * torch.randn(FRAME)).clamp(0, 255))
+        assert not strained(tracker.references[0], estimate).any(), noise
+    assert strained(tracker.references[0], estimate._replace(covariance=900 * estimate.covariance)).all()
 
 
 def test_a_search_of_the_whole_frame_leaves_some_for_those_near():

@@ -39,8 +39,8 @@ def sandwich(noise: Noise, normal: Normal, interpolation: str = "") -> Sandwich:
     of_pixels, of_noise = (normal.bread, normal.meat), (normal.bread_bias, normal.meat_bias)
     sums = [m for bread, meat in (of_pixels, of_noise) for m in (bread.roll(-1, 1), bread.roll(-2, 1), meat)]
     placed = noise.place_share[:, None, None] * normal.meat
-    place = none if noise.place is None else noise.place
-    return Sandwich(*sums, placed, place, none if alias is None else alias @ alias.mT)
+    sums += [placed, none if noise.place is None else noise.place, none if alias is None else alias @ alias.mT]
+    return Sandwich(*sums)
 
 
 def pose_covariance(

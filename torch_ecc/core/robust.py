@@ -168,7 +168,8 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
     """The best, and whether it fits (n,), of the ``plain`` answer and those that trust leads to if it begins with the
     residuals of least squares, or with those under a median fit, at the ``start`` (B, 3) or where least squares has
     come to, and has not slid away. Where least squares has ``recognised`` (n,) the template and the first trial is no
-    better, no other is made."""
+    better, no other is made; where it has not, one that recognises most of the template fits."""
+    strange = ~recognised
     there = start.index_copy(0, doubted.which, plain.pose)
     here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
@@ -183,6 +184,7 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
     for place, begin in trials if is_cpu(start.device) else trials[:1]:  # elsewhere all templates would go through all
         found = reweighted(doubted, place, *(begin or median_look(doubted, place)))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
+        well |= strange & recognises_most(doubted, found)
         better = torch.where(well == fits, price < least, well)  # what fits most of it, or else what leaves less
         better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
         best, recognised = chosen(better, found, best), recognised & ~better
@@ -192,6 +194,11 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
         if is_cpu(start.device) and bool((fits | recognised).all()):
             break
     return best, fits
+
+
+def recognises_most(doubted: Doubted, found: Solution) -> Tensor:
+    """Where (n,) what is believed is enough, and looks about as usual."""
+    return covers_most(found) & (correlation(found.normal, found.total) >= RECOGNISED * doubted.usual)
 
 
 def cost(doubted: Doubted, found: Solution, gain: Tensor) -> tuple[Tensor, Tensor]:

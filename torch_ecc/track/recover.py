@@ -19,18 +19,19 @@ from torch import Tensor
 from torch_ecc.core.align import solve, solve_again
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
-from torch_ecc.core.pose import compose, rotation, unwrap
+from torch_ecc.core.pose import unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import Memory
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
-from torch_ecc.core.verdict import expected_score, just_as_good, unknown, within_margin
+from torch_ecc.core.verdict import expected_score, just_as_good, predicted_sigma, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, REACH, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
 from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.textureless import least_contrast, textureless
+from torch_ecc.track.together import TOGETHER, gone_together
 
 FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
 AT_ONCE = 4  # templates searched for in the whole of one frame; the others in turn
@@ -43,8 +44,8 @@ KNOWN = 0.75 * REACH  # px: look-alikes of a place found near are known if it is
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
 COARSE = (8.0, ANGLE_STEP)  # px, rad: as finely as places are told apart before they are refined
 SLID = 16.0  # px beyond the last step: where something else was tracked, if it does not look as usual either
-FEWEST_TOGETHER = 3  # templates that must have gone the same way for others to be looked for there
-TOGETHER = 3.0  # px: they have gone the same way, and more than half of those that were found have
+STRAIN = 0.1  # px at the farthest pixel: less is a sampler's own
+STRAINED = 8.0  # times the sigma that noise as large as the residuals would leave: what was found is something else
 
 
 class Past(NamedTuple):
@@ -131,6 +132,15 @@ def told(estimate: Estimate, templates: list[int], reason: Reason) -> Estimate:
 def familiar(found: Estimate, usual: Tensor) -> Tensor:
     """Places (n,) that were found and look as the templates ``usual`` (n,) do."""
     return within_margin(found.score, usual) & (found.status == Status.CONVERGED)
+
+
+def strained(reference: Reference, found: Estimate) -> Tensor:
+    """Places (n,) where templates were found whose residuals cling together as those of noise do not: what is there
+    is much like the template, but another thing."""
+    sigma = predicted_sigma(reference, reference.normal, found.residual_rms.to(found.pose).square())
+    usual, here = ((value * reference.place.lever).norm(dim=1) for value in (sigma, found.sigma))
+    much: Tensor = here > (STRAINED * usual).clamp(min=STRAIN)
+    return much
 
 
 def beats(found: Estimate, hand: Estimate) -> Tensor:
@@ -236,7 +246,8 @@ class Recovery:
         found, _ = locator.candidates(views, 0, pose, allowed=self.allowed(past, index))
         found = found.at(~self.max_step.exceeded(found.pose, pose, past.since[r]))
         best = found.at(index.new_zeros(1)) if len(found.pose) else estimate.at(index)
-        if not (familiar(best, past.usual[index]) & beats(best, estimate.at(index))):
+        known = familiar(best, past.usual[index]) & ~strained(locator.pyramids[0][0], best)
+        if not (known & beats(best, estimate.at(index))):
             return estimate
         radius = self.reference.place.radius[r]
         distance = pose_distance(best.pose[0], pose, radius=radius)
@@ -358,21 +369,3 @@ class Recovery:
                 del self.locators[next(iter(self.locators))]
             self.locators[r] = new
         return self.locators[r]
-
-
-def gone_together(estimate: Estimate, start: Tensor, those: Tensor) -> Tensor | None:
-    """Where all templates are expected (R, 3) if they have moved from the ``start`` (R, 3) as most of ``those`` (R,)
-    have; None if these are few or have not gone the same way."""
-    count = int(those.sum())
-    if count < FEWEST_TOGETHER:
-        return None
-    expected = compose(common_motion(start[those], estimate.pose[those]).expand_as(start), start)
-    agree = torch.hypot(*(estimate.pose - expected)[those, :2].T) <= TOGETHER
-    return expected if int(agree.sum()) >= max(FEWEST_TOGETHER, count // 2 + 1) else None
-
-
-def common_motion(start: Tensor, pose: Tensor) -> Tensor:
-    """The motion (3,) of the frame that takes poses ``start`` (n, 3) to ``pose`` (n, 3), or most of them: medians."""
-    angle = (pose - start)[:, 2].median()
-    shift = pose[:, :2] - (rotation(angle) @ start[:, :2].mT).mT
-    return torch.cat((shift.median(0).values, angle[None]))
