@@ -2,18 +2,21 @@
 
 Every iteration has to read of each pixel 4 rows of K and the frame's value, 20 bytes; so many times the pixels and the
 iterations over the measured rate of a copy is the roofline, of which the share reached is printed. The solve is the one
-of an accelerator on any device: all iterations, no look of the host at a value; eager, as what torch.compile makes of
-it, and on a CUDA device replayed as a graph. The cases come in the order of what they tell; when the ``--minutes`` are
-over those that are left are named and what was measured is written. Beside torch it needs kornia, pydantic, click and
-rich.
+of an accelerator on any device: all iterations, no look of the host at a value; the torch page eager, as what
+torch.compile makes of it, and on a CUDA device replayed as a graph; there the fused engine too, which reads less and
+ends sooner than that, and on a CPU the native one. Last, what the gradient of poses costs. The cases come in the order
+of what they tell; when the ``--minutes`` are over those that are left are named and what was measured is written.
+Beside torch it needs kornia, pydantic, click and rich.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Some
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +28,7 @@ from scaling import SCENE, spread
 from torch import Tensor
 
 from torch_ecc import Estimate, Tracker
-from torch_ecc.core import clinging, robust, sampling, solver, verdict
+from torch_ecc.core import sampling
 from torch_ecc.core.align import solve
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
@@ -99,7 +102,8 @@ def visited(reference: Reference, settings: Settings) -> int:
 @contextmanager
 def never_looking() -> Iterator[None]:
     """Within, a CPU does what an accelerator does."""
-    modules, looks = (clinging, robust, sampling, solver, verdict), sampling.is_cpu
+    loaded, looks = list(sys.modules.items()), sampling.is_cpu
+    modules = [each for name, each in loaded if name.startswith("torch_ecc.") and hasattr(each, "is_cpu")]
     try:
         for module in modules:
             module.is_cpu = lambda device: False
@@ -135,11 +139,20 @@ def compiled(solve: Solve, image: Tensor, pose: Tensor) -> Solve:
     return torch.compile(solve, fullgraph=True, dynamic=False)
 
 
-WAYS: dict[str, Callable[[Solve, Tensor, Tensor], Solve]] = {
-    "eager": lambda solve, image, pose: solve,
-    "graph": captured,
-    "compiled": compiled,
+def as_it_is(solve: Solve, image: Tensor, pose: Tensor) -> Solve:
+    """``solve``, operation by operation."""
+    return solve
+
+
+WAYS: dict[str, tuple[str, Callable[[Solve, Tensor, Tensor], Solve]]] = {  # a backend, and how it is called
+    "fused graph": ("fused", captured),
+    "graph": ("torch", captured),
+    "fused": ("fused", as_it_is),
+    "native": ("native", as_it_is),
+    "eager": ("torch", as_it_is),
+    "compiled": ("torch", compiled),
 }
+THERE = {"cuda": ["fused graph", "graph", "fused", "eager"], "cpu": ["native", "eager"]}  # elsewhere the page alone
 
 
 def cases(counts: Some[int], sizes: Some[int], ways: Some[str]) -> list[Case]:
@@ -151,7 +164,7 @@ def cases(counts: Some[int], sizes: Some[int], ways: Some[str]) -> list[Case]:
     ]
     every.sort(key=lambda case: (case.count, case.size) != (counts[-1], sizes[-1]))
     last = [Case(counts[-1], sizes[-1], "bspline3", way) for way in ways if way == "compiled"]
-    return [*every, Case(counts[-1], sizes[-1], "bspline3", first[-1], robust=True), *last]
+    return [*every, Case(counts[-1], sizes[-1], "bspline3", first[0], robust=True), *last]
 
 
 def measure(case: Case, frames: list[Tensor], place: torch.device, iterations: int) -> tuple[float, float, int]:
@@ -159,12 +172,14 @@ def measure(case: Case, frames: list[Tensor], place: torch.device, iterations: i
     first, *images = frames
     tracker = Tracker(first, spread(case.count, case.size + 40, FRAME).round(), case.size, device=place)
     reference, start = tracker.references[0], tracker.pose.clone()
-    settings = Settings(case.sampler, iterations, backend="torch", robust=case.robust)
+    backend, made = WAYS[case.way]
+    settings = Settings(case.sampler, iterations, backend=backend, robust=case.robust)
     some = torch.arange(min(CHECKED, case.count), device=place)
     near = reference.select(some).map(lambda tensor: tensor.cpu())
-    exact = follow(lambda image, pose: solve(near, image, pose, settings), [i.cpu() for i in images], start[some].cpu())
+    page = replace(settings, backend="torch")
+    exact = follow(lambda image, pose: solve(near, image, pose, page), [i.cpu() for i in images], start[some].cpu())
     with never_looking():
-        replay = WAYS[case.way](lambda image, pose: solve(reference, image, pose, settings), images[0], start)
+        replay = made(lambda image, pose: solve(reference, image, pose, settings), images[0], start)
         found = follow(replay, images, start)
         taken = seconds(place, lambda: follow(replay, images, start), 3)
     apart = max(float((a[some].cpu() - b).abs().max()) for a, b in zip(found, exact, strict=True))
@@ -182,6 +197,23 @@ def told(case: Case, rate: float, speed: float, apart: float, least: int) -> lis
         Number(f"{case}: share of the roofline", speed * least / rate, "", "higher", 0.3),
         Number(f"{case}: from the CPU's poses", apart, "px"),
     ]
+
+
+def gradient_cost(frames: list[Tensor], place: torch.device) -> Number:
+    """The time of a backward pass over that of the solve without one: 16 templates of 61 px."""
+    first, image, *_ = frames
+    tracker = Tracker(first, spread(16, 101, FRAME).round(), 61, device=place)
+    reference, start, settings = tracker.references[0], tracker.pose.clone(), Settings(robust=False)
+    wanted = image.float().requires_grad_()
+
+    def both() -> None:
+        with torch.enable_grad():
+            solve(reference, wanted, start, settings).pose.sum().backward()
+
+    alone = seconds(place, lambda: solve(reference, image, start, settings), 10)
+    share = seconds(place, both, 10) / alone - 1
+    console.print(f"the gradient of poses: {share:.2f} times the solve")
+    return Number("gradient of poses over the solve", share, "", "lower", 0.3)
 
 
 def numbers(_: click.Context, __: click.Parameter, value: str | None) -> list[int] | None:
@@ -212,7 +244,7 @@ def main(
     """Poses per second, share of the roofline, agreement with the CPU."""
     place, end = torch.device(device), time.monotonic() + 60 * minutes
     counts = counts or ([1, 64, 1024, 4096, 16384] if place.type == "cuda" else [1, 16])
-    ways = ["eager", *(["graph"] if place.type == "cuda" else []), *(["compiled"] if compiled else [])]
+    ways = [*THERE.get(place.type, ["eager"]), *(["compiled"] if compiled else [])]
     shots = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).closed(), Camera())
     views, rate = [view[None].to(place) for view in shots], copy_rate(place)
     console.print(f"{place}: copies {rate / 1e9:.1f} GB/s; {len(views) - 1} frames, {iterations} iterations")
@@ -222,6 +254,7 @@ def main(
         figures += told(case, rate, *measure(case, views, place, iterations))
     for case in left:
         console.print(f"{case}: no time was left")
+    figures.append(gradient_cost(views, place))
     if out:
         save(out, figures, device=str(place), iterations=str(iterations))
 

@@ -76,3 +76,22 @@ def test_the_prefilter_is_an_operator():
     image = torch.randn(2, 1, 20, 30)
     torch.library.opcheck(torch.ops.torch_ecc.prefilter, (image, "bspline3", 1))
     assert torch.equal(torch.ops.torch_ecc.prefilter(image, "bspline5", 2), prefilter(image, "bspline5", 2))
+
+
+def test_iterations_are_a_loop(blindly):
+    """However many there are: the graph is as long."""
+    templates, images, start = problem(0)
+    reference, sizes, found = te.prepare(templates), [], []
+
+    def counting(module, _):
+        sizes.append(len(module.graph.nodes))
+        return module
+
+    for most in (4, 15):
+        torch.compiler.reset()
+        compiled = torch.compile(te.align, backend=counting, fullgraph=True, dynamic=False)
+        options = {"max_iterations": most, "backend": "torch", "robust": False}
+        found.append((compiled(reference, images, start, **options), blindly(reference, images, start, **options)))
+    assert sizes[0] == sizes[1]
+    for came, wanted in found:
+        assert_same(came, wanted)

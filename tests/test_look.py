@@ -11,6 +11,7 @@ from test_accelerator import NoWaiting
 from torch.fx.experimental.proxy_tensor import make_fx
 
 import torch_ecc as te
+from torch_ecc.core.pushed import strongest, weakest
 from torch_ecc.sim.scene.scene import PlaneWaves
 from torch_ecc.track import look
 
@@ -106,3 +107,15 @@ def test_gradients_are_not_recorded():
     follow.track(frame).pose.sum().backward()
     assert frame.grad.abs().max() > 0
     assert follow._look.graph is None
+
+
+@pytest.mark.parametrize(("found", "at"), [(weakest, 0), (strongest, 2)])
+def test_directions_as_lapack_has_them(found, at):
+    """Whatever the units, and of singular matrices too."""
+    half = torch.randn(50, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    matrix = torch.cat((half @ half.mT, 1e-12 * half @ half.mT, torch.diag(half[0].diagonal().square())[None]))
+    matrix[-1, 1, 1] = 0
+    vector, wanted = found(matrix), torch.linalg.eigh(matrix)[1][:, :, at]
+    alike = (vector * wanted).sum(1).abs() / torch.linalg.vector_norm(vector, dim=1)
+    assert (alike > 0.99).all()
+    assert found(torch.zeros(1, 3, 3, dtype=torch.float64)).isfinite().all()

@@ -14,6 +14,7 @@ from functools import lru_cache, wraps
 from typing import ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 
 PIXELS_PER_THREAD = 2**20  # of templates, some 5 ms of work
 
@@ -78,20 +79,20 @@ def threads_of_caller() -> int:
     return getattr(_here, "threads", None) or torch.get_num_threads()
 
 
-def region(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """A part that torch.compile compiles once, however often a graph goes through it (torch 2.8 on). torch.export would
-    forget the sizes in it, and takes it as it is."""
-    mark = getattr(torch.compiler, "nested_compile_region", None)
-    if mark is None:
-        return function
-    marked: Callable[Arguments, Result] = mark(function)
+def repeated(body: Callable[..., tuple[Tensor, ...]], values: tuple[Tensor, ...], times: int) -> tuple[Tensor, ...]:
+    """The ``values`` after so many times ``body``. To torch.compile that is a loop, which it compiles once."""
+    if not torch.compiler.is_compiling() or torch.compiler.is_exporting():
+        for _ in range(times):
+            values = body(*values)
+        return values
+    from torch._higher_order_ops.while_loop import while_loop
 
-    @wraps(function)
-    def part(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        once = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
-        return (marked if once else function)(*args, **kwargs)
-
-    return part
+    done = torch.zeros((), dtype=torch.int64, device="cpu")  # the host counts
+    values = tuple(value.clone() for value in values)  # none may be another's view
+    last: tuple[Tensor, ...] = while_loop(
+        lambda done, *_: done < times, lambda done, *values: (done + 1, *body(*values)), (done, *values)
+    )
+    return last[1:]
 
 
 def constant(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

@@ -20,6 +20,7 @@ from torch_ecc.core.solution import Engine, Solution, Trust
 PUSH = 0.5  # px, of the farthest pixel
 LEAST_ANSWER = 0.1  # where no direction answers more, nothing holds the pose
 MOST_LEFT = 0.7  # of a push: more is noise's
+DOUBLINGS = 6  # of a power: what is a tenth less is then a thousandth
 
 
 @torch.no_grad()
@@ -52,8 +53,31 @@ def by_information(normal: Normal) -> tuple[Tensor, Tensor]:
     leave."""
     unit = normal.bread_bias.diagonal(dim1=1, dim2=2).clamp(min=LEAST).rsqrt()
     information = normal.bread * unit[:, :, None] * unit[:, None]
-    directions: Tensor = torch.linalg.eigh(information.nan_to_num(0.0, 0.0, 0.0))[1]
-    return directions[:, :, 0] * unit, directions[:, :, 2] * unit
+    information = information.nan_to_num(0.0, 0.0, 0.0)
+    return weakest(information) * unit, strongest(information) * unit
+
+
+def weakest(matrix: Tensor) -> Tensor:
+    """The eigenvector (B, 3), of some length, of a symmetric ``matrix`` (B, 3, 3) >= 0 with its least eigenvalue: that
+    of its cofactors with the largest."""
+    scaled = matrix / trace(matrix)
+    return strongest(torch.linalg.cross(scaled.roll(-1, 1), scaled.roll(-2, 1)))
+
+
+def strongest(matrix: Tensor) -> Tensor:
+    """That with the largest one: nothing else is left of the powers. (LAPACK's has the host look at it.)"""
+    power = matrix + LEAST * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
+    for _ in range(DOUBLINGS):
+        power = power / trace(power)
+        power = power @ power
+    largest = power.diagonal(dim1=1, dim2=2).argmax(1)
+    vector: Tensor = power.gather(2, largest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    return vector
+
+
+def trace(matrix: Tensor) -> Tensor:
+    """(B, 1, 1) of (B, 3, 3)."""
+    return matrix.diagonal(dim1=1, dim2=2).sum(1).clamp(min=LEAST)[:, None, None]
 
 
 def trusted(found: Solution) -> Trust | None:

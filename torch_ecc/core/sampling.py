@@ -214,8 +214,8 @@ def _mirror(index: Tensor, size: int) -> Tensor:
 @constant
 def _to_unit(h: int, w: int, device: torch.device) -> Tensor:
     """What takes px from the first pixel to grid_sample's coordinates plus 1, which end at 2: (2, 1)."""
-    ends = [[2 / max(w - 1, 1)], [2 / max(h - 1, 1)]]
-    return torch.tensor(ends, dtype=pose_dtype(device), device=device)
+    ends = (2 / max(w - 1, 1), 2 / max(h - 1, 1))
+    return torch.cat([torch.full((1, 1), end, dtype=pose_dtype(device), device=device) for end in ends])
 
 
 def _lookup(image: Tensor, points: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from math import inf
 import torch
 from torch import Tensor
 
-from torch_ecc.core.ambient import region
+from torch_ecc.core.ambient import repeated
 from torch_ecc.core.reference import Reference, each, restrict, reweigh
 from torch_ecc.core.sampling import Sampler, inside, is_cpu, make_sampler
 from torch_ecc.core.settings import Settings
@@ -77,19 +77,28 @@ def iterate(
     state = state._replace(error=torch.full_like(state.error, inf))
     sample = make_sampler(interpolation, image, warp, reference.grid.box)
     g, visible = torch.zeros_like(reference.weight), None
+    size = (image.shape[-2], image.shape[-1])
+    if not on_cpu:
+
+        def one_more(warp: Tensor, g: Tensor, seen: Tensor, *last: Tensor) -> tuple[Tensor, ...]:
+            state = State(*last)
+            busy = (state.error > tolerance) & (state.iterations < most)
+            warp = torch.where(busy[:, None, None], reference.warps(state.pose), warp)  # else as it was last seen
+            state, g, visible = iteration(reference, sample, state, warp, g, busy, trusted, size)
+            return warp, g, torch.ones_like(seen) if visible is None else visible, *state
+
+        _, g, visible, *last = repeated(one_more, (warp, g, g > 0, *state), most)
+        return State(*last), g, visible
     for _ in range(most):
         busy = (state.error > tolerance) & (state.iterations < most)
-        if on_cpu and not busy.any():
+        if not busy.any():
             break
-        warp = torch.where(busy[:, None, None], reference.warps(state.pose), warp)  # else as it was last seen
+        warp = torch.where(busy[:, None, None], reference.warps(state.pose), warp)
         sample = make_sampler(interpolation, image, warp, reference.grid.box, sample)
-        state, g, visible = iteration(
-            reference, sample, state, warp, g, busy, trusted, (image.shape[-2], image.shape[-1])
-        )
+        state, g, visible = iteration(reference, sample, state, warp, g, busy, trusted, size)
     return state, g, visible
 
 
-@region
 def iteration(
     reference: Reference,
     sample: Sampler,
