@@ -1,4 +1,4 @@
-"""What runs elsewhere and cannot be tried here: the workflow files are read, and test the oldest versions claimed."""
+"""What runs elsewhere and cannot be tried here: workflow files are read, and test the oldest versions that we claim."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -110,14 +111,15 @@ def _by_pillow(path: Path, mode: str | None) -> Pixels:
 
 
 def _by_opencv(path: Path) -> Pixels:
-    log = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    logging: Any = getattr(cv2.utils, "logging", cv2)  # until OpenCV 4.10 it was there
+    level = logging.getLogLevel()
+    logging.setLogLevel(0)
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
     finally:
-        cv2.utils.logging.setLogLevel(log)
+        logging.setLogLevel(level)
     if pixels is None:
         raise ValueError("it is damaged or not an image")
     return pixels if pixels.ndim == 2 or pixels.shape[2] < 3 else np.ascontiguousarray(pixels[:, :, 2::-1])
