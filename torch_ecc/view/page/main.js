@@ -172,8 +172,8 @@ function row(mark, number) {
   dot.className = "dot";
   dot.style.background = colour(number);
   const size = mark.points ? "outline" : `${mark.w}×${mark.h}`;
-  const cells = words
-    ? [[`${number}`], [size], [words]]
+  const cells = !sigma // not fixed, or the server has not said yet
+    ? [[`${number}`], [size], [words ?? "…"]]
     : [
         [`${number}`],
         [size],
@@ -187,7 +187,7 @@ function row(mark, number) {
     if (small) cell.append(Object.assign(document.createElement("small"), { textContent: small }));
   }
   line.cells[0].prepend(dot, " ");
-  if (words) Object.assign(line.cells[2], { colSpan: 3, className: "words" });
+  if (!sigma) Object.assign(line.cells[2], { colSpan: 3, className: words ? "words" : "" });
   const remove = Object.assign(document.createElement("button"), { type: "button", className: "plain", textContent: "×" });
   remove.setAttribute("aria-label", `Remove patch ${number}`);
   remove.disabled = running();
