@@ -81,12 +81,12 @@ def test_a_lens_is_told_to_the_simulator_and_to_the_track(tmp_path):
     """What the one bends the other straightens, from numbers and from a file; without it the body is far off."""
     config = {
         "scene": {"kind": "waves", "count": 40},
-        "motion": {"kind": "ramp", "points": 3, "end": [60.0, 0.0, 0.0], "lead_in": 0},
+        "motion": {"kind": "ramp", "points": 7, "end": [60.0, 0.0, 0.0], "lead_in": 0},
         "camera": {"size": [200, 280], "noise_sigma": 1.0, "lens": {"k1": 0.03}},
         "template": {"size": [41, 41]},
     }
     sequence = from_config(config).sequence
-    np.save(tmp_path / "v.npy", sequence.batch(0, 3)[:, 0].numpy())
+    np.save(tmp_path / "v.npy", sequence.batch(0, 7)[:, 0].numpy())
     (tmp_path / "lens.toml").write_text("center = [139.5, 99.5]\nfocal = 171.337\nk1 = 0.03\n")
     errors = []
     for k, lens in enumerate((None, "0.03", str(tmp_path / "lens.toml"))):

@@ -48,7 +48,7 @@ def test_marks_that_nobody_has_told_of_bend_no_pose(mark: str) -> None:
     """From the frame on in which they can be told; before it sigma covers what they do."""
     motion = path()
     frames = filmed(motion, SHOWN[mark])
-    tracker = Tracker(frames[0], CENTER, SIZE)
+    tracker = Tracker(frames[0], CENTER, SIZE, frame_mask="find")
     track = tracker.track_sequence(frames[1:])
     error, far = off(track, motion), torch.tensor([0.1, 0.1, 0.1 * torch.pi / 180])
     assert (track.status == Status.CONVERGED).all()
@@ -70,7 +70,7 @@ def test_a_camera_without_marks_has_none(light: float) -> None:
     covered = frames.clone()
     covered[5:, 60:90, 70:85] = 90
     for shown in (frames, covered, covered[4:5].expand(8, -1, -1), frames[:1].expand(8, -1, -1)):
-        tracker = Tracker(shown[0], CENTER, SIZE)
+        tracker = Tracker(shown[0], CENTER, SIZE, frame_mask="find")
         tracker.track_sequence(shown[1:])
         assert not tracker.marks.any()
         assert not tracker.heed.any()
@@ -83,10 +83,10 @@ def test_templates_that_marks_do_not_bend_do_not_heed_them() -> None:
     frames = torch.where(X < 90, frames, still)  # what moves vanishes behind it
     noise = 2 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(4))
     frames = (frames + noise).round().clamp(0, 255).to(torch.uint8)
-    both = Tracker(frames[0], [(70.0, 75.0), (125.0, 75.0)], 61)
+    both = Tracker(frames[0], [(70.0, 75.0), (125.0, 75.0)], 61, frame_mask="find")
     track = both.track_sequence(frames[1:])
     assert both.heed.tolist() == [1, 0]
-    alone = Tracker(frames[0], [(125.0, 75.0)], 61).track_sequence(frames[1:])
+    alone = Tracker(frames[0], [(125.0, 75.0)], 61, frame_mask="find").track_sequence(frames[1:])
     torch.testing.assert_close(track.pose[:, 1], alone.pose[:, 0], atol=1e-5, rtol=0)
     torch.testing.assert_close(track.coverage[:, 1], alone.coverage[:, 0], atol=1e-3, rtol=0)
 
@@ -94,10 +94,10 @@ def test_templates_that_marks_do_not_bend_do_not_heed_them() -> None:
 def test_copies_and_states_know_the_marks() -> None:
     motion = path()
     frames = filmed(motion, SHOWN["stripe"])
-    used = Tracker(frames[0], CENTER, SIZE)
+    used = Tracker(frames[0], CENTER, SIZE, frame_mask="find")
     used.track_sequence(frames[1:6])
     assert used.heed.any()
-    other = Tracker(filmed(motion)[0], CENTER, SIZE)
+    other = Tracker(filmed(motion)[0], CENTER, SIZE, frame_mask="find")
     other.load_state_dict(copy.deepcopy(used.state_dict()))
     copies = [copy.deepcopy(used), other, copy.deepcopy(used).to("cpu")]
     expected = used.track_sequence(frames[6:])

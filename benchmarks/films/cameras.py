@@ -24,30 +24,31 @@ def around(shot: Shot) -> tuple[Tensor, Tensor]:
     return x, y[:, None]
 
 
-def shut(shot: Shot, opacity: Tensor, told: bool = False) -> Film:
-    """BLACK by an ``opacity`` (h, w) that stays with the camera; whether the tracker is ``told`` where."""
+def shut(shot: Shot, opacity: Tensor, known: str = "") -> Film:
+    """BLACK by an ``opacity`` (h, w) that stays with the camera; ``known``: whether the tracker is "told" where,
+    or is to "find" it."""
     image = torch.lerp(shot.clean, torch.tensor(BLACK), opacity.float())
-    options = {"frame_mask": opacity == 0} if told else {}
+    options = {"": {}, "told": {"frame_mask": opacity == 0}, "find": {"frame_mask": "find"}}[known]
     return shot.film(image, (opacity > 0.05).expand_as(image), options=options)
 
 
-def aperture(shot: Shot, told: bool = False) -> Film:
+def aperture(shot: Shot, known: str = "") -> Film:
     """A round field of view that cuts the template's corners."""
-    return shut(shot, (torch.hypot(*around(shot)) - 0.58 * shot.size).clamp(0, 1), told)
+    return shut(shot, (torch.hypot(*around(shot)) - 0.58 * shot.size).clamp(0, 1), known)
 
 
-def stripe(shot: Shot, opacity: float = 1.0, told: bool = False) -> Film:
+def stripe(shot: Shot, opacity: float = 1.0, known: str = "") -> Film:
     """A dark stripe of 8 px, slanted by 10 deg."""
     x, y = around(shot)
-    return shut(shot, opacity * (4.5 - (x + math.tan(math.radians(10)) * y - 12).abs()).clamp(0, 1), told)
+    return shut(shot, opacity * (4.5 - (x + math.tan(math.radians(10)) * y - 12).abs()).clamp(0, 1), known)
 
 
-def dust(shot: Shot, opacity: float = 1.0, grains: int = 10, told: bool = False) -> Film:
+def dust(shot: Shot, opacity: float = 1.0, grains: int = 10, known: str = "") -> Film:
     """Dark grains of 2 to 5 px on the sensor."""
     x, y = around(shot)
     u = torch.rand(grains, 3, generator=torch.Generator().manual_seed(shot.seed)) - 0.5
     off = [3.5 + 3 * r - torch.hypot(x - shot.size * a, y - shot.size * b) for a, b, r in u.tolist()]
-    return shut(shot, opacity * torch.stack(off).amax(0).clamp(0, 1), told)
+    return shut(shot, opacity * torch.stack(off).amax(0).clamp(0, 1), known)
 
 
 def fixed_pattern(shot: Shot, sigma: float = 4.0) -> Film:

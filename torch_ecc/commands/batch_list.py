@@ -51,8 +51,8 @@ def read_list(recordings: Recordings, values: Mapping[str, Any]) -> tuple[BatchJ
         raise ValueError(f"{where}: recordings: expected at least one, got none")
     paths = list(dict.fromkeys(paths))
     jobs = _jobs(paths, values, job, where)
-    if job.parts > 1 and any(each.average > 1 or each.renew for each in jobs.values()):
-        raise ValueError("average, renew: not with parts, each of which would have learned something else")
+    if job.parts > 1 and any(each.average > 1 or each.renew or each.find_marks for each in jobs.values()):
+        raise ValueError("average, renew, find_marks: not with parts, each of which would have learned something else")
     found = zip(_folder_names(paths), paths, strict=True)
     return job, [Recording(name, replace(jobs[path], input=path), arrays.get(path)) for name, path in found]
 

@@ -94,6 +94,9 @@ class TrackJob(Tracking):
         "image of the frame's size, black where the camera shows a mark of its own: dust, aperture",
         example="mask.png",
     )
+    find_marks: bool = described(
+        False, "find such marks: what stays where it was in the first frame while the templates move"
+    )
     template: tuple[str, ...] = described(
         (),
         "image of each template, instead of size: found anywhere, at any angle, nearest to its centre if given",
@@ -135,6 +138,8 @@ class TrackJob(Tracking):
             raise ValueError("body: not with bodies, which tells the templates apart first")
         if self.bodies is not None and self.bodies < 1:
             raise ValueError(f"bodies: expected at least 1, got {self.bodies}")
+        if self.find_marks and self.frame_mask is not None:
+            raise ValueError("find_marks: not with frame_mask, which tells of them")
 
     def calibration(self, of_file: Point | None = None) -> Calibration | None:
         """Pixels to micrometres, None if neither the job nor the file tells the scale."""

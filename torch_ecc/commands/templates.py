@@ -17,6 +17,7 @@ from torch_ecc.core.frame import as_gray
 from torch_ecc.core.patches import texture
 from torch_ecc.io import open_frames
 from torch_ecc.search.locate import Located
+from torch_ecc.track.sensor import FIND
 
 LEAST_PRECISE = 0.05  # px: patches of a body that tell less of where they are only take time
 TRIED = 4  # places across, and down, of each field of a grid, for the best patch of a body
@@ -57,11 +58,11 @@ def read_templates(job: TrackJob) -> Tensor | None:
     return torch.cat(crops)
 
 
-def read_frame_mask(job: TrackJob) -> Tensor | None:
+def read_frame_mask(job: TrackJob) -> Tensor | str | None:
     """Where the camera shows the scene, (H, W) bool: the brighter half of the grey levels in the image
-    ``job.frame_mask``, None if there is none."""
+    ``job.frame_mask``; FIND, or None if there is none."""
     if job.frame_mask is None:
-        return None
+        return FIND if job.find_marks else None
     image = as_gray("frame_mask", job.frame_mask, open_frames(job.frame_mask).first)[0, 0]
     return image > image.max() / 2
 

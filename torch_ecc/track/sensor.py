@@ -10,10 +10,19 @@ from torch import Tensor
 from torch_ecc.core.dead_lines import DeadLines, dead_lines
 from torch_ecc.core.sight import as_frame_mask
 
+FIND = "find"  # in place of a mask: what the camera shows of its own is to be found out
 
-def shown(where: str, mask: Tensor | None, frame: Tensor) -> Tensor | None:
-    """Where a camera whose ``frame`` (1 or R, 1, H, W) that is shows the scene, None for everywhere."""
-    return None if mask is None else as_frame_mask(where, mask, (frame.shape[2], frame.shape[3])).to(frame.device)
+
+def shown(where: str, mask: Tensor | str | None, frame: Tensor) -> Tensor | None:
+    """Where a camera whose ``frame`` (1 or R, 1, H, W) that is shows the scene, None for everywhere as far as one
+    knows. ValueError for no mask."""
+    if isinstance(mask, str) and mask != FIND:
+        raise ValueError(f"{where}: frame_mask: expected a tensor (H, W) or {FIND!r}, got {mask!r}")
+    return (
+        None
+        if mask is None or isinstance(mask, str)
+        else as_frame_mask(where, mask, (frame.shape[2], frame.shape[3])).to(frame.device)
+    )
 
 
 def dead_in(where: str, frame: Tensor) -> DeadLines | None:

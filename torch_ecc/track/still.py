@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.align import solve_again
+from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.normal import LEAST
 from torch_ecc.core.pose import turn
@@ -72,12 +73,6 @@ class Look(NamedTuple):
         most = max(EXCESS * self.noise, CONTRAST**2 * self.contrast)
         return (self.changed < STILL * self.noise) & (self.left > most)
 
-    @property
-    def shift(self) -> Tensor:
-        """From the frame's first pixel to this one: (2, 3), to be taken from warps."""
-        y, x = self.corner
-        return torch.tensor([[0, 0, x], [0, 0, y]], dtype=torch.float64)
-
     def within(self, part: Tensor, like: Tensor) -> Tensor:
         """A ``part`` (h, w) of it as one of a frame ``like`` (H, W)."""
         whole, (y, x) = torch.zeros_like(like, dtype=torch.bool), self.corner
@@ -93,7 +88,7 @@ def look(still: Still, pose: Tensor, clean: Reference) -> Look:
     x0, x1, y0, y1 = (*span(x, width), *span(y, height))
     view, before = still.image[0, 0, y0:y1, x0:x1].float(), still.first[y0:y1, x0:x1].float()
     before = before * still.level[1] + still.level[0]
-    now, home = (W - torch.cat((torch.zeros(2, 2), torch.tensor([[x0], [y0]])), 1).to(W) for W in warps)
+    now, home = (warps - shift(y0, x0, warps)).unbind()
     pixels = homogeneous(view)
     expected, known = projected(reference, now, pixels, (y1 - y0, x1 - x0))
     known &= still.shown[y0:y1, x0:x1]
@@ -107,6 +102,11 @@ def look(still: Still, pose: Tensor, clean: Reference) -> Look:
     own = torch.where(inside(since, pixels, view.shape), picked(new, since, pixels), 0.0).view(view.shape)
     texture = mean(before.square()) - mean(before).square()
     return Look((y0, x0), changed, left if still.pure else left.maximum(own), texture, noise, contrast)
+
+
+def shift(y: int, x: int, like: Tensor) -> Tensor:
+    """From the frame's first pixel to another one: (2, 3), to be taken from warps."""
+    return torch.tensor([[0, 0, x], [0, 0, y]], dtype=like.dtype, device=like.device)
 
 
 def span(places: Tensor, size: int) -> tuple[int, int]:
@@ -253,7 +253,8 @@ class Still(NamedTuple):
         of as much as leaves what is left of the others in blocks that are ``trusted`` (1, blocks), and more than noise.
         """
         seen, reference, axes = look(self, pose, self.reference), self.reference, turn(pose[:, 2])
-        now, home = reference.warps(torch.cat((pose, self.home))).sub_(seen.shift).split(1)
+        warps = reference.warps(torch.cat((pose, self.home)))
+        now, home = (warps - shift(*seen.corner, warps)).split(1)
         pixels, size = reference.grid.pixels, seen.left.shape
         frozen = picked(seen.still, now, pixels) | picked(seen.still, home, pixels)
         moving = inside(now, pixels, size) & ~frozen & (trusted[:, reference.grid.block] == 1)
@@ -282,6 +283,7 @@ class Watch(NamedTuple):
     level: Tensor
 
     @staticmethod
+    @lasting
     def begin(frame: Tensor, start: Tensor) -> Watch:
         """Of templates at ``start`` (R, 3) in a ``frame`` (1 or R, 1, H, W)."""
         none = torch.zeros_like(start[:, 0])
@@ -306,6 +308,7 @@ class Watch(NamedTuple):
         return [r for r, (o, n, d, f) in enumerate(each_one) if o and (n & (n - 1) == 0 or d > FARTHER * f + AROUND)]
 
 
+@torch.no_grad()
 def without_marks(
     tracker: TrackersLook, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor | None
 ) -> tuple[Estimate, bool]:

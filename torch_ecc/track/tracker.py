@@ -55,21 +55,23 @@ class Tracker(nn.Module):
     ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``frame_mask``: (H, W), True or > 0 where the
     camera shows the scene, and not a mark of its own (aperture, stripe, dust): what of a template is there, or within
-    some 3 to 6 px, is out of sight, as beyond the frame's border; ``device``: where everything lives (default:
-    the frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in sight
-    it is out of view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
-    (``core.robust``); ``search``: look for a template that is lost, or looks less like itself than usual, near where it
-    is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
-    more seldom the longer it stays so (every 16th frame in the end); ``search_share``: of the time, what searches may
-    take at most in the long run (1: no bound); ``max_step``: (px, deg), how far a template's
-    centre moves, and how far it turns, from one frame to the next at most: nothing farther is believed, nor looked at;
-    ``backend``: "auto", "torch", "native" or "fused", see settings.Settings. ``average``: the templates become the mean
-    of so many frames, the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last
-    so many frames, again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up,
-    and sigma tells what the anchor is still worth. Nothing is learned from frames that are not CONVERGED or are
-    covered, nor where something is suddenly another. ``line_time``: seconds from the exposure of one row to the next,
-    of a camera with a rolling shutter that takes ``fps`` frames per second: poses are those of the instant at which the
-    row of the template's centre is exposed (``track.shutter``); in the first frame it is at rest.
+    some 3 to 6 px, is out of sight, as beyond the frame's border, or "find": what stays where it was in the first
+    frame while the templates move is taken for such marks (``track.still``; a sheen that stays may be, too);
+    ``device``: where everything lives (default: the frame's); ``min_score``: below it a template is lost;
+    ``min_visible``: with less of its weight in sight it is out of view; ``robust``: blocks of pixels that do not fit,
+    as of what covers a part of a template, count less (``core.robust``); ``search``: look for a template that is lost,
+    or looks less like itself than usual, near where it is expected and, if it has no plausible place, in the whole
+    frame at any angle: in every frame at first, and ever more seldom the longer it stays so (every 16th frame in the
+    end); ``search_share``: of the time, what searches may take at most in the long run (1: no bound); ``max_step``:
+    (px, deg), how far a template's centre moves, and how far it turns, from one frame to the next at most: nothing
+    farther is believed, nor looked at; ``backend``: "auto", "torch", "native" or "fused", see settings.Settings.
+    ``average``: the templates become the mean of so many frames, the first one among them: less noise in dim pictures.
+    ``renew``: they become the mean of the last so many frames, again and again, for surfaces that change; anchored to
+    the first such mean, so that nothing adds up, and sigma tells what the anchor is still worth. Nothing is learned
+    from frames that are not CONVERGED or are covered, nor where something is suddenly another. ``line_time``: seconds
+    from the exposure of one row to the next, of a camera with a rolling shutter that takes ``fps`` frames per second:
+    poses are those of the instant at which the row of the template's centre is exposed (``track.shutter``); in the
+    first frame it is at rest.
 
     What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
     with its own options. A state comes whole or not at all; what does not fit is refused before anything is changed.
@@ -108,7 +110,7 @@ class Tracker(nn.Module):
         levels: int = 1,
         prediction: str = "velocity",
         mask: Tensor | None = None,
-        frame_mask: Tensor | None = None,
+        frame_mask: Tensor | str | None = None,
         device: torch.device | str | None = None,
         min_score: float = 0.5,
         min_visible: float = 0.25,
@@ -133,7 +135,7 @@ class Tracker(nn.Module):
         self.shutter.check(gray.shape[2])
         self.dead = dead_in("Tracker", gray)
         gray = gray if self.dead is None else self.dead.repair(gray)
-        self.frame_mask = shown("Tracker", frame_mask, gray)
+        self.frame_mask, self.finds_marks = shown("Tracker", frame_mask, gray), isinstance(frame_mask, str)
         patches = unmarked("Tracker", locate_patches("Tracker", gray, centers, size, mask), self.frame_mask)
         check_levels(levels, patches.size)
         self._begin(gray, patches)
@@ -173,6 +175,7 @@ class Tracker(nn.Module):
         tracker.dead = dead_in("find", view)
         view = view if tracker.dead is None else tracker.dead.repair(view)
         tracker.frame_mask, tracker.frame_shape = shown("find", frame_mask, view), tuple(view.shape)
+        tracker.finds_marks = isinstance(frame_mask, str)
         for name, value in Watch.begin(view, tracker.start)._asdict().items():
             tracker.register_buffer(name, value)
         tracker._use(tracker.references)
@@ -193,7 +196,7 @@ class Tracker(nn.Module):
     @property
     def watches(self) -> bool:
         """Whether it looks for marks of its camera, ``track.still``: one that exposes all rows at once."""
-        return self.frame_mask is None and self.frame_shape[0] == 1 and self.shutter.line == 0
+        return self.finds_marks and self.settings.robust and self.frame_shape[0] == 1 and self.shutter.line == 0
 
     def _prepared(self, state: Mapping[str, Tensor]) -> list[Reference]:
         """Every level of the templates in a ``state``."""
