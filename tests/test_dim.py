@@ -10,6 +10,7 @@ from torch import Tensor
 
 import torch_ecc as te
 from torch_ecc import Reason, Status
+from torch_ecc.core import pushed
 from torch_ecc.core.sampling import blur
 from torch_ecc.sim import micrograph
 
@@ -96,3 +97,17 @@ def test_a_blurred_picture_is_no_noise():
     found = tracker(frame(blur(sharp, 4.0)[0, 0], 2, 1))
     assert found.status == Status.CONVERGED
     assert (found.displacement / found.sigma).abs().max() < 5
+
+
+def test_what_has_texture_is_asked_no_more_and_grain_always(monkeypatch):
+    """After some frames in which it came back clearly."""
+    asked, left_of_push = [], pushed.left_of_push
+    monkeypatch.setattr(pushed, "left_of_push", lambda *given: asked.append(1) or left_of_push(*given))
+    tracker = te.Tracker(frame(waves(4.0), 4, 0), [(100.0, 100.0)], SIZE, search=False)
+    for k in range(pushed.ENOUGH + 4):
+        assert tracker(frame(waves(4.0), 4, k + 1)).status == Status.CONVERGED
+    assert len(asked) == pushed.ENOUGH == int(tracker.answered)
+    grain = te.Tracker(edge(40.0, 3.0, 1.0, 0), [(100.0, 100.0)], 121, search=False)
+    for k in range(pushed.ENOUGH + 4):
+        assert int(grain(edge(40.0, 3.0, 1.0, k + 1)).reason) in {Reason.NOISE, Reason.UNSURE}
+    assert int(grain.answered) == 0

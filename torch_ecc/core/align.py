@@ -12,7 +12,7 @@ from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
 from torch_ecc.core.native import engine as native
-from torch_ecc.core.pushed import MOST_LEFT, left_of_push
+from torch_ecc.core.pushed import Push
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution
@@ -81,15 +81,17 @@ def solve_again(
     memory: robust.Memory | None = None,
 ) -> tuple[Estimate, Solution]:
     """The same with a ``memory`` of the frames before; and what it is judged from."""
-    # What is left of a push would make half as much again of a graph.
-    left = None if torch.compiler.is_compiling() else partial(pushed, reference, image, settings)
+    push = None  # which would make half as much again of a graph
+    if not torch.compiler.is_compiling():
+        engine = partial(engine_for, reference, image, settings)
+        push = Push(engine, reference, image, settings, None if memory is None else memory.answered)
     if not implicit.wanted(reference, image, pose):
         there = found(reference, image, pose, settings, memory)
-        return judge(reference, there, pose, settings, origin, left), there
+        return judge(reference, there, pose, settings, origin, push), there
     with torch.no_grad():
         there = found(reference, image.detach(), pose.detach(), settings, memory)
     attached = implicit.attached(reference, image, pose, there, settings)
-    return judge(reference, attached, pose, settings, origin, left), there
+    return judge(reference, attached, pose, settings, origin, push), there
 
 
 def found(
@@ -104,8 +106,3 @@ def engine_for(reference: Reference, image: Tensor, settings: Settings) -> Engin
     fit = (engine.solve for engine in (native, fused) if engine.takes(reference, image, settings))
     engine = next(fit, solver.solve)
     return engine if reference.sight is None else partial(sight.solve, engine)
-
-
-def pushed(reference: Reference, image: Tensor, settings: Settings, there: Solution) -> Tensor:
-    """What is left (B,) of a push, over what may be, see ``left_of_push``."""
-    return left_of_push(engine_for(reference, image, settings), reference, image, settings, there) / MOST_LEFT

@@ -3,10 +3,14 @@
 In a direction that has no texture a template's own noise is all that answers, and sigma, made of its gradients, knows
 nothing of it. What noise adds to them can be told if it is white. Of noise that was blurred, as by a colour filter, a
 JPEG or a denoiser, nothing in one image tells that it is none of the scene's; but another frame does not have it, and
-there the template stays where it was pushed to.
+there the template stays where it was pushed to. A template that has come back clearly in so many frames has texture:
+it is not asked again while all of it counts.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,7 +24,33 @@ from torch_ecc.core.solution import Engine, Solution, Trust
 PUSH = 0.5  # px, of the farthest pixel
 LEAST_ANSWER = 0.1  # where no direction answers more, nothing holds the pose
 MOST_LEFT = 0.7  # of a push: more is noise's
+CLEARLY = 0.5  # of that: less is texture's, if it is so in
+ENOUGH = 8  # frames in a row
 DOUBLINGS = 6  # of a power: what is a tenth less is then a thousandth
+
+
+class Push(NamedTuple):
+    """How B templates are pushed in an ``image``: by the ``engine`` that it gives for them. ``answered`` (B,): in how
+    many frames in a row they came back clearly, None if nobody counts."""
+
+    engine: Callable[[], Engine]
+    reference: Reference
+    image: Tensor
+    settings: Settings
+    answered: Tensor | None = None
+
+    def unanswered(self, share: Tensor) -> Tensor:
+        """The ``share`` (B,) of the information that may be noise's of templates all of whose pixels count: 0 of those
+        that have answered."""
+        return share if self.answered is None else torch.where(self.answered < ENOUGH, share, 0.0)
+
+    def __call__(self, found: Solution, asked: Tensor) -> Tensor:
+        """What is left, over what may be, of those that are ``asked`` (B,) bool, 0 of the others."""
+        share = left_of_push(self.engine(), self.reference, self.image, self.settings, found) / MOST_LEFT
+        if self.answered is not None:
+            count = torch.where(share < CLEARLY, self.answered + 1, 0)
+            self.answered.copy_(torch.where(asked, count, self.answered))
+        return torch.where(asked, share, 0.0)
 
 
 @torch.no_grad()

@@ -50,15 +50,17 @@ class Scale(NamedTuple):
 
 class Memory(NamedTuple):
     """What is known of B templates from the frames before: their usual ``score`` (B,), and the ``trust`` (B, blocks)
-    that there was in them in the last one."""
+    that there was in them in the last one; and in how many they ``answered`` (B,) a push, see ``pushed``."""
 
     score: Tensor
     trust: Tensor
+    answered: Tensor
 
     @staticmethod
     def none(reference: Reference) -> Memory:
         """Of templates that have not been seen yet."""
-        return Memory(expected_score(reference), torch.ones_like(reference.blocks.weight))
+        score = expected_score(reference)
+        return Memory(score, torch.ones_like(reference.blocks.weight), torch.zeros_like(score, dtype=torch.long))
 
 
 class Doubted(NamedTuple):
@@ -79,7 +81,8 @@ class Doubted(NamedTuple):
     def of(engine: Engine, reference: Reference, image: Tensor, settings: Settings, memory: Memory) -> Doubted:
         """All of them."""
         which, floor = torch.arange(len(memory.score), device=memory.score.device), least_noise(reference, settings)
-        return Doubted(engine, reference, image, settings, which, reference.blocks, floor, *memory)
+        usual, last = memory.score, memory.trust
+        return Doubted(engine, reference, image, settings, which, reference.blocks, floor, usual, last)
 
     def at(self, part: Tensor) -> Doubted:
         """Some of them."""

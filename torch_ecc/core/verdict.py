@@ -5,7 +5,7 @@ It is made for every frame, of few numbers: what can be known before is, and on 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import inf
 from typing import NamedTuple, TypeVar
 
@@ -20,6 +20,7 @@ from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.core.noise import NOISE_SHARE
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.pose import turn
+from torch_ecc.core.pushed import Push
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
@@ -93,10 +94,10 @@ def judge(
     start: Tensor,
     settings: Settings,
     origin: Tensor | None = None,
-    left: Callable[[Solution], Tensor] | None = None,
+    push: Push | None = None,
 ) -> Estimate:
     """The record of B solved templates; failed ones get their ``start`` (B, 3) back. ``displacement`` counts from
-    ``origin`` (B, 3), by default the start. ``left``: what is of a push, over what may be."""
+    ``origin`` (B, 3), by default the start. ``push``: what tells texture from noise."""
     normal, total, pose, axes = found.normal, found.total, found.pose, turn(found.pose.select(1, 2))
     constant = known(reference, normal, settings.interpolation)
     power, error, score = found.gain.square(), total.select(1, 6), correlation(normal, total)
@@ -110,14 +111,17 @@ def judge(
     covariance = pose_covariance(constant.sandwich, variance, power, bias, scatter, coherent)
     unobservable = largest_variance(reference.place.lever2, covariance), constant.share * bias
     visible, believed = seen_and_believed(reference, found)
-    amounts = visible, score, found.gain, believed, *unobservable, found.error, normal.noise_share * variance
+    share, on_cpu = normal.noise_share * variance, is_cpu(pose.device)
+    if push is not None and normal is reference.normal and not (on_cpu and max(share.tolist()) <= LEAST_SHARE):
+        share = push.unanswered(share)
+    amounts = visible, score, found.gain, believed, *unobservable, found.error, share
     if strained is not None:  # which is no lack of texture
         covariance = covariance + strained
     covariance = torch.bmm(torch.bmm(axes, covariance), axes.mT)
     tracked, status, reason = (codes.clone() for codes in _zeros(len(pose), pose.device))
     rms = (error / normal.total).sqrt()
-    if not (is_cpu(pose.device) and beyond_doubt(amounts, settings)):
-        status, reason = verdict(reference, found, amounts, settings, left)
+    if not (on_cpu and beyond_doubt(amounts, settings)):
+        status, reason = verdict(reference, found, amounts, settings, push)
         good = Status.good(status)
         unfitted = ~good & ~normal.noise_share.isfinite()  # singular: all that is in sight of the patch is left
         rms = torch.where(unfitted, (total[:, 2] / normal.total.clamp(min=LEAST)).sqrt(), rms)
@@ -138,19 +142,19 @@ def verdict(
     found: Solution,
     amounts: Sequence[Tensor],
     settings: Settings,
-    left: Callable[[Solution], Tensor] | None = None,
+    push: Push | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Status and reason codes (B,) int8 from the ``amounts``, (B,) each, that ``VERDICTS`` are about, of which the
     second is the score: light that varies and noise must not make a stranger of the template. The last one is the share
     of the information that noise is if it is white. Where that may be noise of another kind, and all else is well,
-    noise is what is ``left`` of a push."""
+    noise is what a ``push`` leaves."""
     visible, score, *others, noise, error, share = amounts
     match = torch.maximum(score, detrended(found.normal, found.total))
     match = torch.maximum(match, without_noise(reference, found, score))
     first = failed(torch.stack((visible, match, *others, noise, error), 1), settings)
     doubtful = (share > LEAST_SHARE) & Status.good(_codes(0, first.device).index_select(0, first))
-    if left is not None and not (is_cpu(first.device) and not bool(doubtful.any())):
-        noise = torch.maximum(noise, torch.where(doubtful, left(found), 0.0))
+    if push is not None and not (is_cpu(first.device) and not bool(doubtful.any())):
+        noise = torch.maximum(noise, push(found, doubtful))
         first = failed(torch.stack((visible, match, *others, noise, error), 1), settings)
     return explained(reference, found, first, match, settings.min_score)
 

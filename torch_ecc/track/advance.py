@@ -56,7 +56,7 @@ class Remembering:
 
     def __call__(self, reference: Reference, pose: Tensor) -> Estimate:
         state = self.state
-        memory = Memory(state["score"], state["trust"])
+        memory = Memory(*(state[name] for name in Memory._fields))
         estimate, found = solve_again(reference, self.image, pose, self.settings, state["start"], memory)
         self.odd = found.odd
         if found.trust is None:

@@ -50,7 +50,9 @@ class Look:
         if len(self.references) > 1 or not self.recordable(image):
             return self.made(image, images)
         if self.graph is None or not self.graph.fits(image):
-            self.graph = Graph(lambda frame: self.made(frame, [frame]), image, self.state["trust"])
+            self.graph = Graph(
+                lambda frame: self.made(frame, [frame]), image, [self.state["trust"], self.state["answered"]]
+            )
         return self.graph(image)
 
     def recordable(self, image: Tensor) -> bool:
@@ -81,10 +83,11 @@ class Graph:
     when it was recorded."""
 
     @lasting
-    def __init__(self, look: Callable[[Tensor], Result], image: Tensor, kept: Tensor) -> None:
-        self.image, before = image.clone(), kept.clone()
+    def __init__(self, look: Callable[[Tensor], Result], image: Tensor, kept: list[Tensor]) -> None:
+        self.image, before = image.clone(), [part.clone() for part in kept]
         self.repeat, self.result = recorded(lambda: look(self.image), image.device)
-        kept.copy_(before)
+        for new, old in zip(kept, before, strict=True):
+            new.copy_(old)
 
     def fits(self, image: Tensor) -> bool:
         """Whether an ``image`` is like the first one."""
