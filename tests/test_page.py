@@ -297,6 +297,7 @@ def test_a_run_is_watched_and_a_reload_loses_nothing(clockwork, data, gate, tmp_
         each.wait_for_selector("#files:visible")
         assert "Tracked 30 frames" in each.inner_text("#words")
     other.close()
+    page.bring_to_front()  # a tab that nobody sees draws nothing
     with page.expect_download() as download:
         page.click("#files >> text=track.csv")
     assert_same_track(Path(download.value.path()), data, tmp_path)
@@ -350,7 +351,11 @@ def click_a_curve(page) -> None:
     chart = page.locator(".chart canvas").first
     chart.scroll_into_view_if_needed()
     box = chart.bounding_box()
-    page.mouse.click(box["x"] + 66 + (box["width"] - 74) * 10 / 29, box["y"] + 40)
+    for _ in range(20):  # until what came last is drawn
+        page.mouse.click(box["x"] + 66 + (box["width"] - 74) * 10 / 29, box["y"] + 40)
+        page.wait_for_timeout(500)
+        if "Frame 10" in page.inner_text("#said"):
+            break
     page.wait_for_selector("#said:has-text('Frame 10')")
     assert page.inner_text("#number") == "10 of 55"
     assert " ± " in page.inner_text(".chart figcaption >> nth=0")
