@@ -10,12 +10,11 @@ from torch import Tensor
 from torch_ecc.body.body import Body
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.paper import fig8, fig10, fig11
-from torch_ecc.paper.acquisition import Bench, microscope, simulated_once, tracker_of, zeroed
+from torch_ecc.paper.acquisition import Bench, simulated_once, tracker_of, zeroed
 from torch_ecc.paper.errors import box, largest, rms
-from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table, counter
-from torch_ecc.paper.steps import GAIN, LAMP, VIEW_UM, ZOOM, Staircase, command, compared, step_table
+from torch_ecc.paper.result import Advance, Experiment, Number, Picture, Table
+from torch_ecc.paper.steps import GAIN, Staircase, climbed, step_table
 from torch_ecc.records.motion import dwell_errors
-from torch_ecc.sim import GradientLight, LampDrift, Lights
 from torch_ecc.sim.scene.scene import Scene
 from torch_ecc.track.tracker import Tracker
 
@@ -66,12 +65,7 @@ def fields(height: int, width: int) -> Tensor:
 @simulated_once
 def staircase(quick: bool, advance: Advance) -> Staircase:
     """Dwells of 1 s, ``quick``: of 0.3 s and a smaller part of the sensor; simulated at the first call only."""
-    dwell_s = 0.3 if quick else 1.0
-    view, path = microscope(quick, zoom=ZOOM, view_um=VIEW_UM), command(dwell_s)
-    frames = Bench(view).frames(path)
-    light = Lights((GradientLight(), LampDrift(LAMP, period=2.2 * frames)))
-    acquired = BodyBench(view, light, GAIN).acquire(path, counter(frames, advance))
-    return with_truth(compared(acquired, view, dwell_s))
+    return with_truth(climbed(lambda view, light: BodyBench(view, light, GAIN), 0.3 if quick else 1.0, quick, advance))
 
 
 def with_truth(found: Staircase) -> Staircase:

@@ -6,7 +6,7 @@ Simulated once for all four figures.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import torch
@@ -68,12 +68,15 @@ def command(dwell_s: float) -> Tensor:
 @simulated_once
 def staircase(quick: bool, advance: Advance) -> Staircase:
     """Dwells of 3 s; simulated at the first call only. ``quick``: dwells of 0.3 s, and a smaller part of the sensor."""
-    dwell_s = 0.3 if quick else 3.0
+    return climbed(lambda view, light: Bench(view, light, GAIN, METHODS), 0.3 if quick else 3.0, quick, advance)
+
+
+def climbed(bench: Callable[[Microscope, Lights], Bench], dwell_s: float, quick: bool, advance: Advance) -> Staircase:
+    """What a ``bench`` records of the staircase under a lamp that drifts, in dwells of ``dwell_s``."""
     view, path = microscope(quick, zoom=ZOOM, view_um=VIEW_UM), command(dwell_s)
     frames = Bench(view).frames(path)
     light = Lights((GradientLight(), LampDrift(LAMP, period=2.2 * frames)))
-    acquired = Bench(view, light, GAIN, METHODS).acquire(path, counter(frames, advance))
-    return compared(acquired, view, dwell_s)
+    return compared(bench(view, light).acquire(path, counter(frames, advance)), view, dwell_s)
 
 
 def compared(acquired: Acquisition, view: Microscope, dwell_s: float) -> Staircase:
