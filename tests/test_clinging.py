@@ -9,10 +9,12 @@ from torch import Tensor
 
 from torch_ecc import Status, align, prepare
 from torch_ecc.core.blocks import STRAINS
-from torch_ecc.core.clinging import clinging, patterns, scale_of, without_strain
+from torch_ecc.core.clinging import clinging, scale_of
+from torch_ecc.core.clinging import strains as strains_shown
 from torch_ecc.core.native.engine import solve as native
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import solve
+from torch_ecc.core.strain import strained_by, strained_pose, without_strain
 from torch_ecc.sim import Pads, PlaneWaves
 
 SIZE, FRAME, MIDDLE = 91, (151, 160), (80.0, 75.0)
@@ -82,7 +84,8 @@ def test_patterns_are_what_strains_leave(criterion):
     """From the sums of blocks as from all pixels, under weights too; what they fit is gone."""
     reference, image, start = Problem((40, 43), mask="one", centred=False, dtype=torch.float32).made(criterion)
     found = solve(reference, image, start, Settings())
-    pattern, _, shift = patterns(reference.parts, found)
+    strains = strains_shown(reference, found)
+    pattern, shift = strains.pattern.unflatten(2, (3, -1)), strains.shift
     (gx, gy), grid = reference.signal[0, :2], reference.grid
     x, y = (grid.pixels[:2] - reference.place.centre[0, :, None]) / float(reference.place.radius)
     for k, (moved, _) in enumerate(STRAINS):
@@ -94,10 +97,11 @@ def test_patterns_are_what_strains_leave(criterion):
         scale = float(direct.abs().max())
         torch.testing.assert_close(pattern[0, k], direct, rtol=0, atol=2e-3 * scale)
         torch.testing.assert_close(shift[0, :, k], u[:3], rtol=2e-3, atol=1e-5)
-        strained = found._replace(sums=found.sums.clone(), gain=torch.ones_like(found.gain))
-        strained.sums[0, 7:] = 0.3 * direct
-        rest, covariance = without_strain(reference.parts, strained)
-        assert rest.abs().max() < 0.01 * scale
+        effect = 0.3 * direct[None]
+        strain, _, certain = strained_by(strains, effect)
+        assert certain > 0.99
+        assert without_strain(strains, effect, strain).abs().max() < 0.01 * scale
+        covariance = strained_pose(strains, strain[:, :, None] * strain[:, None])
         shifted = 0.09 * u[:3].double().square()
         torch.testing.assert_close(covariance[0].diagonal()[:2], shifted[:2], rtol=0.02, atol=1e-6)
 

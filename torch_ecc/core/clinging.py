@@ -2,9 +2,9 @@
 
 What no noise model knows (edges that the sampler rounds, light, an occluder, blur, a line of a sensor) leaves residuals
 that cling together. Their effect on a pose, summed over all of a cluster of pixels before it is squared, tells the
-scatter that they bring (the cluster-robust sandwich). A target that is strained, as by focus, by a lens, or by a camera
-that exposes one row after the other, leaves a pattern of them that is known: by how much it is strained is told from
-them, and the pose is as uncertain as what one calls its place and its angle then is.
+scatter that they bring (the cluster-robust sandwich). A target that is strained leaves a pattern of them that is known,
+see ``strain``: by how much it is strained is told from them, and the pose is as uncertain as what one calls its place
+and its angle then is.
 """
 
 from __future__ import annotations
@@ -15,17 +15,14 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import constant
-from torch_ecc.core.blocks import STRAINS, Parts
-from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.normal import LEAST, Normal
-from torch_ecc.core.reference import Fields, Grid, Reference, each
+from torch_ecc.core.reference import Grid, Reference, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.solution import SUMS, Solution, clustered
+from torch_ecc.core.strain import Strains, strained_by, strained_pose, strains_of, without_strain
 
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
 SURE = 3.0  # standard deviations by which lines must scatter more than blocks do: lines are few, and scatter by chance
-LEAST_SPREAD = 0.2  # of the mean: blocks that tell next to nothing count by what they tell
-BY_CHANCE = 14.0  # so large may the square of 7 strains over its variance be by chance
 
 
 class Clinging(NamedTuple):
@@ -37,27 +34,40 @@ class Clinging(NamedTuple):
     strained: Tensor | None
 
 
+class Residuals(NamedTuple):
+    """Of B templates: their ``effect`` (B, 3, blocks) on the pose in each block, its ``ratio`` (B, 3, 3) to what white
+    noise has, of square sums over blocks, rows and columns, ``unit`` (B, 9) what takes such sums there; the patch's
+    ``gain`` (B,), and the ``strains`` that the template may show."""
+
+    effect: Tensor
+    ratio: Tensor
+    unit: Tensor
+    gain: Tensor
+    strains: Strains
+
+
 def clinging(reference: Reference, found: Solution, white: Tensor, scale: Tensor | None) -> Clinging:
     """What clings together in the residuals of B templates whose template and frame have noise of variance ``white``
     (B,) together if it is that, with clusters of a ``scale_of``."""
     if scale is None:
         return Clinging(None, None)
-    scatter, certain = scattered(found.total[:, SUMS:], white, scale)
-    on_cpu = is_cpu(white.device)
+    unit, on_cpu = scale / white.unsqueeze(1), is_cpu(white.device)
+    ratio = (found.total[:, SUMS:] * unit).view(-1, 3, 3)
+    scatter = ratio[:, :1].clamp(min=1.0)
+    certain = (ratio > scatter).flatten(1).any(1)  # of lines, that they scatter more; blocks never do
     if on_cpu and not bool(certain.any()):
         return Clinging(scatter, None)
-    certain = certain.flatten(1).any(1)
-    index = certain.nonzero()[:, 0] if on_cpu else torch.arange(len(certain), device=certain.device)
-    effect, strained = without_strain(_at(index, reference.parts), _at(index, found))
-    certain, grid = certain[index], reference.grid.blocks
-    ratio = clustered(effect.to(white.dtype), grid)
-    blocks, more = scattered(ratio, white[index], scale[index])
-    lines = (ratio * scale[index] / white[index, None]).view(-1, 3, 3) * _shares(grid, white.dtype, white.device)[1]
-    most = torch.where(more, lines, blocks).amax(1, keepdim=True)
-    most = torch.where(certain[:, None, None], most, scatter[index])
-    strained = torch.where(certain[:, None, None], strained, 0.0)
-    none = strained.new_zeros(len(scatter), 3, 3)
-    return Clinging(scatter.index_copy(0, index, most), none.index_copy(0, index, strained))
+    all_of_it = Residuals(found.sums[:, 7:], ratio, unit, found.gain, strains(reference, found))
+    if not on_cpu or bool(certain.all()):
+        more, strained = explained(all_of_it, reference.grid.blocks)
+        chosen = certain[:, None, None]
+        strained = None if strained is None else torch.where(chosen, strained, 0.0)
+        return Clinging(torch.where(chosen, more, scatter), strained)
+    index = certain.nonzero()[:, 0]
+    more, strained = explained(each(lambda value: value[index], all_of_it), reference.grid.blocks)
+    none = scatter.new_zeros(len(scatter), 3, 3)
+    strained = None if strained is None else none.index_copy(0, index, strained)
+    return Clinging(scatter.index_copy(0, index, more), strained)
 
 
 def scale_of(grid: Grid, normal: Normal) -> Tensor | None:
@@ -71,70 +81,28 @@ def scale_of(grid: Grid, normal: Normal) -> Tensor | None:
     return (normal.white.new_tensor([[free], [1], [1]]) / (sure * normal.white[:, None])).flatten(1)
 
 
-def scattered(squares: Tensor, white: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """How much more the square sums (B, 9) over blocks tell than white noise of variance ``white`` (B,) makes of them,
-    (B, 1, 3), and where (B, 3, 3) those over lines tell more than that for certain; over blocks they never do."""
-    ratio = (squares * scale / white.unsqueeze(1)).view(-1, 3, 3)
+def explained(residuals: Residuals, grid: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
+    """What clings together, see ``Clinging``, in residuals less those of the strain that fits them best, if they are
+    it for certain."""
+    effect, ratio, unit, gain, strains = residuals
+    strain, uncertain, certain = strained_by(strains, effect)
+    strained = None
+    if not (is_cpu(gain.device) and not any(certain.tolist())):
+        effect = without_strain(strains, effect, strain * (certain > 0)[:, None])
+        ratio = (clustered(effect.to(unit.dtype), grid) * unit).view(-1, 3, 3)
+        square = strain[:, :, None] * strain[:, None] + uncertain
+        strained = strained_pose(strains, square * (certain / gain.to(certain).square())[:, None, None])
     scatter = ratio[:, :1].clamp(min=1.0)
-    return scatter, ratio > scatter
+    lines = ratio * _shares(grid, ratio.dtype, ratio.device)[1]
+    return torch.where(ratio > scatter, lines, scatter).amax(1, keepdim=True), strained
 
 
-def without_strain(parts: Parts, found: Solution) -> tuple[Tensor, Tensor]:
-    """The effect (B, 3, blocks) of residuals on the pose less that of the strain that fits it best, and the covariance
-    (B, 3, 3) that this strain brings, see ``Clinging``.
-
-    To shear is to turn and to strain by the same angle: a camera that shifts its rows turns the target by half of it,
-    or by none, as one takes it.
-    """
-    pattern, spread, shift = patterns(parts, found)
-    effect, weighted = found.sums[:, 7:], pattern / spread[:, None]
-    gram = torch.einsum("bmkn,blkn->bml", weighted, pattern)
-    fit = torch.einsum("bml,blkn->bmkn", safe_inverse(gram)[0], weighted)
-    strain = torch.einsum("bmkn,bkn->bm", fit, effect)
-    left = effect - torch.einsum("bm,bmkn->bkn", strain, pattern)
-    of_blocks = torch.einsum("bmkn,bkn->bmn", fit, left)  # what else each of them adds
-    uncertain = of_blocks @ of_blocks.mT
-    certain = (1 - BY_CHANCE / ratio_of_squares(strain, uncertain)).clamp(min=0)[:, None]
-    effect = effect - torch.einsum("bm,bmkn->bkn", strain * (certain > 0), pattern)
-    square = (strain[:, :, None] * strain[:, None] + uncertain) * (certain / found.gain.to(certain).square()[:, None])[
-        ..., None
-    ]
-    turned = (square.diagonal(dim1=1, dim2=2) * _turning(square.dtype, square.device)).sum(1) / parts.radius.square()
-    strained = (shift @ square @ shift.mT).to(turned.dtype)
-    strained[:, 2, 2] += turned
-    return effect, strained.nan_to_num(0.0, 0.0, 0.0)
-
-
-def ratio_of_squares(value: Tensor, covariance: Tensor) -> Tensor:
-    """v^T C^-1 v of values (B, n) with a covariance (B, n, n): n by chance; 0 where it is singular."""
-    inverse, regular = safe_inverse(covariance)
-    ratio = (value[:, None] @ inverse @ value[..., None])[:, 0, 0]
-    return torch.where(regular, ratio, 0.0)
-
-
-def patterns(parts: Parts, found: Solution) -> tuple[Tensor, Tensor, Tensor]:
-    """What strains, see ``Parts``, leave in each block under a gain of 1, as a pose feels it, (B, 7, 3, blocks); what
-    white noise of some variance leaves there, (B, 3, blocks); and by what they shift the pose, (B, 3, 7)."""
-    normal, share = found.normal, found.sums[:, 0] / parts.weight.clamp(min=LEAST)
-    share = (share if found.trust is None else share * found.trust)[:, None, None]
-    of_columns, of_strain = parts.normal * share, parts.strain * share
-    shift = (normal.inverse @ of_strain.sum(-1, dtype=normal.inverse.dtype)).to(share.dtype)
-    left = of_strain - torch.einsum("bpqn,bqm->bpmn", of_columns, shift)
-    rows = normal.inverse[:, :3].to(share.dtype)
-    power = torch.einsum("bkp,bpkn->bkn", rows, of_columns[:, :, :3]).clamp(min=0)
-    spread = (power + LEAST_SPREAD * power.mean(2, keepdim=True)) * normal.white.to(share.dtype).unsqueeze(2)
-    return torch.einsum("bkp,bpmn->bmkn", rows, left), spread.clamp(min=LEAST), shift[:, :3]
-
-
-def _at(index: Tensor, record: Fields) -> Fields:
-    """The part of a ``record`` that is about the templates at ``index`` (n,)."""
-    return each(lambda value: value[index], record)
-
-
-@constant
-def _turning(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Which of ``STRAINS`` turn parts of the target, 0 or 1."""
-    return torch.tensor([float(turns) for _, turns in STRAINS], dtype=dtype, device=device)
+def strains(reference: Reference, found: Solution) -> Strains:
+    """Those that templates may show, of the blocks in sight and as far as they are trusted."""
+    if found.trust is None and found.normal is reference.normal:
+        return reference.strains
+    share = found.sums[:, 0] / reference.parts.weight.clamp(min=LEAST)
+    return strains_of(reference.parts, found.normal, share if found.trust is None else share * found.trust)
 
 
 @constant

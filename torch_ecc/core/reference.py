@@ -33,6 +33,7 @@ from torch_ecc.core.noise import DIM_BLURS, INSTRUMENT_BLUR, NOISE_SHARE, Noise,
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.pose import pose_dtype, rotation
 from torch_ecc.core.sampling import SAMPLERS, aliasing, gradients, pad
+from torch_ecc.core.strain import Strains, strains_of
 
 if TYPE_CHECKING:
     from torch_ecc.core.native.packed import Packed
@@ -134,6 +135,11 @@ class Reference(_Groups):
         """What each block adds to the normal equations: made once, if it is needed."""
         return parts_of(self) if torch.compiler.is_compiling() else self._kept_parts
 
+    @property
+    def strains(self) -> Strains:
+        """What they leave if it is strained: made once, if it is needed."""
+        return strains_of(self.parts, self.normal) if torch.compiler.is_compiling() else self._kept_strains
+
     @cached_property
     def verdicts(self) -> dict[str, Known]:
         """What the verdict on them needs, by sampler: see ``verdict.known``."""
@@ -148,6 +154,11 @@ class Reference(_Groups):
     @lasting
     def _kept_parts(self) -> Parts:
         return parts_of(self)
+
+    @cached_property
+    @lasting
+    def _kept_strains(self) -> Strains:
+        return strains_of(self.parts, self.normal)
 
     @cached_property
     @lasting
@@ -352,8 +363,7 @@ def _solved(criterion: Criterion, grid: Grid, place: Place, columns: Columns, no
 def reweigh(reference: Reference, counted: Tensor) -> Reference:
     """The reference whose pixels count as ``counted`` (B, N), 0 to 1 or bool: new weight, K and normal equations."""
     columns = reference.columns._replace(weight=reference.columns.weight * counted)
-    criterion, grid, place = reference.criterion, reference.grid, reference.place
-    K, normal = _normal_equations(criterion, grid, place, columns, reference.noise.response)
+    K, normal = _normal_equations(*reference[:3], columns, reference.noise.response)
     return reference._replace(columns=columns, K=K, normal=normal)
 
 
