@@ -6,6 +6,7 @@ import json
 import math
 import warnings
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -132,6 +133,22 @@ def test_a_hidden_template_is_not_taken_for_its_twin(lost):
     for _ in range(lost):
         assert tracker(hidden).status == Status.LOST
     assert tracker(image).displacement.abs().max() < 1e-3
+
+
+def test_a_half_that_looks_like_that_of_a_hidden_template_is_not_taken_for_it():
+    """At the border of the frame, where the rest of what it belongs to is out of sight; as a whole it is another one."""
+    rng = np.random.default_rng(3)
+    part, other = rng.normal(size=(2, 61, 61))
+    part = 120 + 60 * np.stack([cv2.GaussianBlur(each, (0, 0), 3) * 6 for each in (part, other)]).clip(-1, 1)
+    scene = np.full(FRAME, 60.0)
+    scene[90:151, 130:191] = part[0]
+    tracker = Tracker(noisy(scene, rng), [(160.0, 120.0)], 61)
+    scene[90:151, 130:191] = 60
+    scene[:31, 20:81] = part[0][30:]
+    for _ in range(4):
+        assert tracker.track(noisy(scene, rng)).status == Status.LOST
+    scene[:31, 20:81], scene[150:211, 220:281] = 60, part[0]  # a whole one is it
+    assert any(bool(tracker.track(noisy(scene, rng)).ok) for _ in range(4))
 
 
 def test_a_leap_is_no_velocity():

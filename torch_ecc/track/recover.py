@@ -22,6 +22,7 @@ from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import Memory
+from torch_ecc.core.sampling import inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
 from torch_ecc.core.verdict import expected_score, just_as_good, predicted_sigma, unknown, within_margin
@@ -44,6 +45,7 @@ KNOWN = 0.75 * REACH  # px: look-alikes of a place found near are known if it is
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
 COARSE = (8.0, ANGLE_STEP)  # px, rad: as finely as places are told apart before they are refined
 SLID = 16.0  # px beyond the last step: where something else was tracked, if it does not look as usual either
+WHOLE = 0.9  # of a template's weight must be in sight where it has leapt to: many things have parts that look alike
 STRAIN = 0.1  # px at the farthest pixel: less is a sampler's own
 STRAINED = 8.0  # times the sigma that noise as large as the residuals would leave: what was found is something else
 
@@ -141,6 +143,13 @@ def strained(reference: Reference, found: Estimate) -> Tensor:
     usual, here = ((value * reference.place.lever).norm(dim=1) for value in (sigma, found.sigma))
     much: Tensor = here > (STRAINED * usual).clamp(min=STRAIN)
     return much
+
+
+def in_sight(reference: Reference, pose: Tensor, image: Tensor) -> Tensor:
+    """At which poses (n, 3) the one template of a ``reference`` lies in the ``image`` (1, 1, H, W) as a whole."""
+    seen = inside(reference.warps(pose), reference.grid.pixels, (image.shape[-2], image.shape[-1]))
+    whole: Tensor = (reference.weight * seen).sum(1) >= WHOLE * reference.weight.sum(1)
+    return whole
 
 
 def beats(found: Estimate, hand: Estimate) -> Tensor:
@@ -244,8 +253,9 @@ class Recovery:
         views = [image if len(image) == 1 else image[r : r + 1] for image in images]
         index = torch.tensor([r], device=pose.device)
         found, _ = locator.candidates(views, 0, pose, allowed=self.allowed(past, index))
-        found = found.at(~self.max_step.exceeded(found.pose, pose, past.since[r]))
-        best = found.at(index.new_zeros(1)) if len(found.pose) else estimate.at(index)
+        possible = ~self.max_step.exceeded(found.pose, pose, past.since[r])
+        found, best = found.at(possible), found.at(possible & in_sight(locator.pyramids[0][0], found.pose, views[0]))
+        best = best.at(index.new_zeros(1)) if len(best.pose) else estimate.at(index)
         known = familiar(best, past.usual[index]) & ~strained(locator.pyramids[0][0], best)
         if not (known & beats(best, estimate.at(index))):
             return estimate
