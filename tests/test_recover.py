@@ -136,7 +136,7 @@ def test_a_hidden_template_is_not_taken_for_its_twin(lost):
 
 
 def test_a_half_that_looks_like_that_of_a_hidden_template_is_not_taken_for_it():
-    """At the border of the frame, where the rest of what it belongs to is out of sight; as a whole it is another one."""
+    """At the border of the frame, the rest of what it belongs to out of sight; as a whole it is another one."""
     rng = np.random.default_rng(3)
     part, other = rng.normal(size=(2, 61, 61))
     part = 120 + 60 * np.stack([cv2.GaussianBlur(each, (0, 0), 3) * 6 for each in (part, other)]).clip(-1, 1)
