@@ -15,8 +15,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -28,6 +28,7 @@ import numpy as np
 import psutil
 import tifffile
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 
 import torch_ecc as te
@@ -235,41 +236,44 @@ def scheduler(count: int) -> None:
 
 
 class Stream:
-    """``count`` frames of 64 x 64 px, each made when it is asked for: a texture that drifts, shakes and turns."""
+    """``count`` frames of 64 x 64 px, each made when it is asked for: exact plane waves that drift, shake and turn,
+    with 1 grey level of noise."""
 
     def __init__(self, count: int, turn: float = 2e-3) -> None:
-        self.shape, self.turn = (count, 64, 64), turn
-        rough = np.random.default_rng(0).normal(size=(256, 256)).astype(np.float32)
-        smooth = cv2.GaussianBlur(rough, (0, 0), 2.0)
-        self.texture = 128 + 40 * smooth / smooth.std()
+        self.shape, self.turn, self.scene = (count, 64, 64), turn, PlaneWaves.random(24)
 
-    def __getitem__(self, index: int) -> np.ndarray:
-        angle = self.turn * index
-        x, y = 6 * np.sin(index / 31) + 3 * np.sin(index / 5000), 5 * np.cos(index / 43)
-        c, s = np.cos(angle), np.sin(angle)
-        matrix = np.array(
-            [[c, s, 128 - c * (31.5 + x) - s * (31.5 + y)], [-s, c, 128 + s * (31.5 + x) - c * (31.5 + y)]]
-        )
-        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        frame = cv2.warpAffine(self.texture, matrix, (64, 64), flags=flags)
-        noise = np.random.Generator(np.random.Philox(index)).standard_normal((64, 64), np.float32)
+    def truth(self, index: NDArray[Any] | int) -> NDArray[np.float64]:
+        """(..., 3) px, px, rad."""
+        k = np.asarray(index, np.float64)
+        x, y = 31.5 + 6 * np.sin(k / 31) + 3 * np.sin(k / 5000), 31.5 + 5 * np.sin(k / 43)
+        return np.stack((x, y, self.turn * k), -1)
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        frame = self.scene.render(torch.from_numpy(self.truth(index))[None], self.shape[1:]).numpy()[0, 0]
+        noise = np.random.Generator(np.random.Philox(index)).standard_normal(frame.shape, np.float32)
         return (frame + noise).round().clip(0, 255).astype(np.uint8)
 
 
 class Memory:
-    """The most that any worker here has used, in MB, in each fifth of a run."""
+    """The most that any of these processes has used, in MB, in each fifth of a run."""
 
-    def __init__(self) -> None:
-        self.fifths = [0.0] * 5
+    def __init__(self, processes: Callable[[], list[psutil.Process]]) -> None:
+        self.processes, self.fifths = processes, [0.0] * 5
 
     def __call__(self, done: int, of: int | None) -> None:
         used = [0.0]
-        for process in workers_here():
+        for process in self.processes():
             with suppress(psutil.Error):
                 memory = process.memory_info()
                 used.append((memory.rss - memory.shared) / 2**20)  # what is mapped from files is not ours
         which = min(5 * done // (of or done or 1), 4)
         self.fifths[which] = max(self.fifths[which], *used)
+
+    def __str__(self) -> str:
+        return f"{[round(each) for each in self.fifths]} MB in each fifth of the run"
+
+
+STREAM: dict[str, Any] = {"centers": [(31.5, 31.5)], "size": 31, "overlay": False}
 
 
 @app.command()
@@ -277,30 +281,50 @@ class Memory:
 @click.option("--parts", default=8)
 @click.option("--workers", default=2)
 @click.option("--whole/--no-whole", default=True, help="Beside the same in one piece.")
-def parts(count: int, parts: int, workers: int, whole: bool) -> None:
-    """A long stream in parts: its seams, memory, time, and what is different in one piece."""
-    with scratch() as folder:
-        settings: dict[str, Any] = {"centers": [(31.5, 31.5)], "size": 31, "overlay": False}
-        memory, started = Memory(), time.perf_counter()
-        done = te.batch({"s": Stream(count)}, folder / "out", workers=workers, parts=parts, progress=memory, **settings)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder that stays; the same command goes on in it.")
+def parts(count: int, parts: int, workers: int, whole: bool, out: Path | None) -> None:
+    """A long stream in parts: its seams, memory, time, errors, and what is different in one piece."""
+    with scratch() if out is None else nullcontext(out) as folder:
+        stream, memory, started = Stream(count), Memory(workers_here), time.perf_counter()
+        done = te.batch({"s": stream}, folder / "out", workers=workers, parts=parts, progress=memory, **STREAM)
         console.print(f"{count} frames in {parts} parts on {workers} workers: {time.perf_counter() - started:.0f} s")
         console.print(f"  {done.rows[0]}", soft_wrap=True)
         for seam in json.loads((folder / "out" / "s" / "batch.json").read_text())["seams"]:
             console.print(f"  {seam}")
-        console.print(f"  memory of a worker in each fifth of the run: {[round(each) for each in memory.fifths]} MB")
-        if not whole:
-            return
-        started = time.perf_counter()
-        job = TrackJob(input="s", out=str(folder / "whole"), centers=((31.5, 31.5),), size=31, overlay=False)
-        Session(job, Stream(count)).run()
-        console.print(f"in one piece: {time.perf_counter() - started:.0f} s")
-        tracks = [np.load(each / "track.npz") for each in (folder / "out" / "s", folder / "whole")]
-        apart = np.abs(tracks[0]["pose"] - tracks[1]["pose"]).reshape(-1, 3)
-        same = (tracks[0]["status"] == tracks[1]["status"]).mean()
-        console.print(
-            f"  joined beside whole: at most {apart[:, :2].max():.1e} px, {apart[:, 2].max():.1e} rad; "
-            f"statuses equal in {100 * same:.2f} %; turned {tracks[1]['pose'][-1, 0, 2] / 2 / np.pi:.1f} times"
-        )
+        console.print(f"  memory of a worker: {memory}")
+        tell_errors(folder / "out" / "s", stream)
+        if whole:
+            run_whole(folder / "whole", stream)
+            tell_differences(folder / "out" / "s", folder / "whole")
+
+
+def run_whole(folder: Path, stream: Stream) -> None:
+    """The stream in one piece, as ``torch-ecc track`` would."""
+    memory, started = Memory(lambda: [psutil.Process()]), time.perf_counter()
+    job = TrackJob(input="s", out=str(folder), resume=(folder / "track.records.part").exists(), **STREAM)
+    Session(job, stream).run(lambda done: memory(done, stream.shape[0]) if done % 1000 == 0 else None)
+    console.print(f"in one piece: {time.perf_counter() - started:.0f} s; memory: {memory}")
+
+
+def tell_errors(folder: Path, stream: Stream) -> None:
+    """How far the poses are from the truth, at most and rms; the template's own noise is in it."""
+    with np.load(folder / "track.npz") as track:
+        error = track["pose"][:, 0] - stream.truth(track["frame"])
+    rms, most = np.sqrt(np.nanmean(error**2, 0)), np.nanmax(np.abs(error), 0)
+    console.print(f"  from the truth (px, px, rad): rms {rms.round(6)}, at most {most.round(6)}")
+
+
+def tell_differences(joined: Path, whole: Path) -> None:
+    """What is joined beside what was tracked in one piece."""
+    tracks = [np.load(each / "track.npz") for each in (joined, whole)]
+    apart = np.abs(tracks[0]["pose"] - tracks[1]["pose"]).reshape(-1, 3)
+    same = (tracks[0]["status"] == tracks[1]["status"]).mean()
+    console.print(
+        f"  joined beside whole: at most {apart[:, :2].max():.1e} px, {apart[:, 2].max():.1e} rad; statuses equal in "
+        f"{100 * same:.2f} %; turned {tracks[1]['pose'][-1, 0, 2] / 2 / np.pi:.1f} times"
+    )
+    lines = [sum(1 for _ in (folder / "track.csv").open("rb")) for folder in (joined, whole)]
+    console.print(f"  lines of track.csv, joined and whole: {lines}")
 
 
 @contextmanager

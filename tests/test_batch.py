@@ -6,11 +6,14 @@ import csv
 import json
 import math
 import os
+import re
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -19,8 +22,8 @@ import tifffile
 import torch
 
 import torch_ecc as te
-from torch_ecc.commands import batch_cluster, batch_parts, batch_report
-from torch_ecc.commands.batch_cluster import _check_worker
+from torch_ecc.commands import batch_cluster, batch_parts, batch_queue, batch_report
+from torch_ecc.commands.batch_cluster import Guard, _misfit
 from torch_ecc.commands.batch_list import read_list
 from torch_ecc.commands.batch_parts import cut, do_join, do_part
 from torch_ecc.commands.batch_queue import Queue, SchedulerGoneError, Task
@@ -210,7 +213,7 @@ def test_nothing_comes_of_work_that_nobody_waits_for(one, tmp_path):
 
 def test_workers_of_other_versions_make_nothing(one, tmp_path):
     row = do(replace(work(one, tmp_path), versions={"torch_ecc": "0.0", "torch": "0.0"}))
-    assert row["status"] == "failed"
+    assert row["status"] == "unfinished"
     assert "versions: they must be equal everywhere" in row["words"]
 
 
@@ -392,15 +395,34 @@ def test_without_a_scheduler_there_is_a_sentence(one, tmp_path, monkeypatch):
 
 def test_workers_that_do_not_fit_are_told_of(tmp_path):
     good = {"versions": versions(), "seen": True, "resources": []}
-    _check_worker("tcp://a:1", good, tmp_path)
-    with pytest.raises(ValueError, match=r"the worker tcp://a:1 has torch_ecc .* and torch 1.0 \(here: "):
-        _check_worker("tcp://a:1", good | {"versions": versions() | {"torch": "1.0"}}, tmp_path)
-    with pytest.raises(
-        ValueError, match=r"out: the worker tcp://a:1 does not see .* a folder that all computers share"
+    other = good | {"versions": versions() | {"torch": "1.0"}}
+    assert _misfit("tcp://a:1", good, tmp_path) is None
+    for seen, words in (
+        (other, r"the worker tcp://a:1 has torch_ecc .* and torch 1.0 \(here: "),
+        (good | {"seen": False}, r"out: the worker tcp://a:1 does not see .* a folder that all computers share"),
+        (ModuleNotFoundError("No module named 'torch_ecc'"), r"cannot import torch_ecc .* install it there, too"),
     ):
-        _check_worker("tcp://a:1", good | {"seen": False}, tmp_path)
-    with pytest.raises(ValueError, match=r"cannot import torch_ecc .* install it there, too"):
-        _check_worker("tcp://a:1", ModuleNotFoundError("No module named 'torch_ecc'"), tmp_path)
+        assert re.search(words, _misfit("tcp://a:1", seen, tmp_path))
+
+
+def test_workers_that_join_and_do_not_fit_are_sent_away(tmp_path, client, monkeypatch):
+    """They would give up all that there is before the others are done with one."""
+    (tmp_path / WORK).mkdir()
+    said, sent = [], []
+    guard = Guard(client, tmp_path, said.append)
+    monkeypatch.setattr(client, "retire_workers", sent.extend)
+    guard()
+    assert not said
+    guard.known = set()  # as if they had just joined
+    guard()
+    assert not said
+    guard.known = set()
+    monkeypatch.setattr(batch_cluster, "versions", lambda: {"torch_ecc": "0", "torch": "0"})
+    guard.out = tmp_path
+    monkeypatch.setattr(batch_cluster, "same_versions", lambda a, b: False)
+    guard()
+    assert sorted(sent) == sorted(client.nthreads())
+    assert all("Sent away: scheduler: the worker" in words for words in said)
 
 
 def test_a_gpu_is_asked_of_the_cluster(one, tmp_path, client):
@@ -411,6 +433,20 @@ def test_a_gpu_is_asked_of_the_cluster(one, tmp_path, client):
 
 def stub(work: Work) -> dict[str, object]:
     return {"folder": work.name, "status": "tracked"}
+
+
+JOINED, BLAMED = threading.Event(), {"1": 1, "2": 9}  # workers in this process see them
+
+
+def patient(work: Work) -> dict[str, object]:
+    return {"folder": work.name, "status": "tracked" if JOINED.wait(20) else "failed"}
+
+
+def deadly(work: Work) -> dict[str, object]:
+    if BLAMED.get(work.name, 0) > 0:
+        BLAMED[work.name] -= 1
+        raise distributed.KilledWorker(work.name, SimpleNamespace(address="tcp://a:1"), 3)
+    return stub(work)
 
 
 def stubs(count: int) -> list[Task]:
@@ -430,6 +466,51 @@ def test_few_calls_are_out_at_a_time(client):
     Queue(stubs(60), came).run(client, lambda: None)
     assert sorted(rows, key=int) == [str(k) for k in range(60)]
     assert max(most) <= 2 * 2
+
+
+def test_workers_that_join_are_given_work_while_nothing_has_come_back(client, monkeypatch):
+    """Recordings may take an hour, and workers come one by one from a queue of their own."""
+    counts = iter(({"a": 1}, {"a": 1, "b": 1}))
+
+    def tasks() -> Iterator[Task]:
+        for k, task in enumerate(stubs(4)):
+            if k == 3:  # two at a time are out for a worker
+                JOINED.set()
+            yield replace(task, make=patient)
+
+    rows = []
+    monkeypatch.setattr(batch_queue, "LOOK", 0.05)
+    monkeypatch.setattr(client, "nthreads", lambda: next(counts, {"a": 1, "b": 1}))
+    Queue(tasks(), rows.append).run(client, lambda: None)
+    assert [row["status"] for row in rows] == ["tracked"] * 4
+
+
+def test_what_was_beside_a_deadly_call_is_not_blamed(client):
+    """Dask blames everything that a worker had when it died."""
+    rows, out = [], []
+
+    def came(row: dict[str, object]) -> None:
+        rows.append(row)
+        out.append(len(queue._out))
+
+    queue = Queue([replace(task, make=deadly) for task in stubs(5)], came)
+    queue.run(client, lambda: None)
+    assert {row["folder"]: row["status"] for row in rows if row["status"] != "tracked"} == {"2": "failed"}
+    assert "it ended its worker 4 times, with nothing beside it" in rows[-1]["words"]
+    assert [len(rows), *out[-2:]] == [5, 0, 0]
+
+
+def test_without_workers_for_long_the_cluster_is_given_up(client, monkeypatch):
+    """Those here do not come back by themselves; what was out is handed out again on the next one."""
+    rows = []
+    monkeypatch.setattr(batch_queue, "LOOK", 0.01)
+    queue = Queue(stubs(3), rows.append, patience=-1.0)
+    with monkeypatch.context() as nobody:
+        nobody.setattr(client, "nthreads", dict)
+        with pytest.raises(SchedulerGoneError):
+            queue.run(client, lambda: None)
+    queue.run(client, lambda: None)
+    assert len(rows) == 3
 
 
 def test_what_was_out_when_the_scheduler_went_is_handed_out_again(client):

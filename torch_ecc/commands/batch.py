@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from torch_ecc.commands.batch_cluster import check_cluster, connected, cores, dashboard_of, need_dask
+from torch_ecc.commands.batch_cluster import (
+    Guard,
+    check_cluster,
+    connected,
+    cores,
+    dashboard_of,
+    leave_bootstrapping,
+    need_dask,
+)
 from torch_ecc.commands.batch_list import Recording, Recordings, read_list
 from torch_ecc.commands.batch_parts import cut, do_join, do_part, forget_parts
 from torch_ecc.commands.batch_queue import Queue, SchedulerGoneError, Task, on_gpu
@@ -82,6 +91,7 @@ def batch(
     cannot be tracked is a row that says why. Ctrl-C ends it; the same call goes on. Raises ValueError before any work
     for what does not fit.
     """
+    leave_bootstrapping()
     need_dask()
     job, listed = read_list(recordings, settings | ({} if out is None else {"out": str(out)}))
     check_report(job)
@@ -182,7 +192,8 @@ class _Run:
 
     def _hand_out(self, client: Client | None, say: Say) -> None:
         """All of it, on another scheduler if one is lost and comes back in time."""
-        queue, deadline = Queue(self._tasks(), self._came), 0.0
+        here = client is None and self.job.scheduler is None
+        queue, deadline = Queue(self._tasks(), self._came, patience=RECONNECT if here else math.inf), 0.0
         while True:
             try:
                 with nullcontext(client) if client is not None else self._cluster() as cluster:
@@ -203,11 +214,11 @@ class _Run:
         return connected(self.job.scheduler, min(most, len(self.todo) * self.job.parts), gpu=self.gpu)
 
     def _use(self, cluster: Client, queue: Queue, say: Say) -> None:
-        check_cluster(cluster, self.folder, gpu=self.gpu)
+        check_cluster(cluster, self.folder, say, gpu=self.gpu)
         if link := dashboard_of(cluster):
             say(f"Dask's dashboard: {link}")
         cluster.subscribe_topic(self.ticket, self.tally.hear)
-        queue.run(cluster, self._withdraw)
+        queue.run(cluster, self._withdraw, Guard(cluster, self.folder, say))
 
     def _tasks(self) -> Iterator[Task]:
         for work in self.todo:

@@ -6,9 +6,12 @@ from __future__ import annotations
 import logging
 import secrets
 import signal
-from collections.abc import Iterator
+import sys
+from asyncio import CancelledError
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
+from multiprocessing import current_process
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +19,15 @@ from torch_ecc.commands.batch_unit import DECIDING, WORK, same_versions
 from torch_ecc.io.summary import versions
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, LocalCluster
 
 PATIENCE = 20.0  # s to wait for a scheduler, and for its first worker
 CLOSING = 3.0  # s that it may take to say goodbye
 GPU = "GPU"  # the resource that a worker with one has
-PROFILE = "distributed.worker.profile.enabled"  # what Dask keeps of a long call grows by the second
+HERE = {
+    "distributed.worker.profile.enabled": False,  # what Dask keeps of a long call grows by the second
+    "distributed.deploy.lost-worker-timeout": "1 day",  # one that takes longer to start again would never be replaced
+}
 
 
 def need_dask() -> None:
@@ -69,11 +75,19 @@ def _quiet() -> Iterator[None]:
 @contextmanager
 def _here(workers: int, *, gpu: bool) -> Iterator[Client]:
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
-    with dask.config.set({PROFILE: False}):
-        cluster = LocalCluster(
-            n_workers=workers,
+    with dask.config.set(HERE), _workers(workers, gpu=gpu) as cluster, Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+def _workers(count: int, *, gpu: bool) -> LocalCluster:
+    """Processes here. ValueError if they cannot be started."""
+    from distributed import LocalCluster
+
+    try:
+        return LocalCluster(
+            n_workers=count,
             threads_per_worker=1,
             processes=True,
             memory_limit=0,  # frames are streamed: what a recording needs does not grow
@@ -82,8 +96,15 @@ def _here(workers: int, *, gpu: bool) -> Iterator[Client]:
             resources={GPU: 1} if gpu else None,
             preload=[__name__],
         )
-    with cluster, Client(cluster, set_as_default=False) as client:
-        yield client
+    except RuntimeError as error:
+        how = "in a script, the call must stand under if __name__ == '__main__':"
+        raise ValueError(f"workers: they cannot be started here ({error}); {how}") from None
+
+
+def leave_bootstrapping() -> None:
+    """End a process that is being started as a worker here and runs the script that started it, down to its batch."""
+    if getattr(current_process(), "_inheriting", False):
+        sys.exit(1)
 
 
 def dask_setup(worker: Any) -> None:
@@ -98,30 +119,63 @@ def cores() -> int:
     return int(CPU_COUNT)
 
 
-def check_cluster(client: Client, out: Path, *, gpu: bool) -> None:
-    """ValueError, in words, for a cluster without workers, with other versions, without a GPU where one is wanted, or
-    that does not see the folder ``out``."""
+def check_cluster(client: Client, out: Path, say: Callable[[str], None], *, gpu: bool) -> None:
+    """Wait until there is a worker. ValueError, in words, for a cluster with workers of other versions, without a GPU
+    where one is wanted, or that do not see the folder ``out``."""
+    address = client.scheduler.address if client.scheduler else "?"
+    _wait_for_one(client, lambda: say(f"No worker has joined {address} yet: dask worker {address} starts one. Waiting"))
+    found = _seen(client, out, list(client.nthreads()))
+    for worker, seen in found.items():
+        if wrong := _misfit(worker, seen, out):
+            raise ValueError(wrong)
+    if gpu and not any(GPU in seen["resources"] for seen in found.values()):
+        raise ValueError(f"device: no worker has the resource {GPU}: dask worker {address} --resources {GPU}=1")
+
+
+def _wait_for_one(client: Client, late: Callable[[], None]) -> None:
+    """By a call for it: some clusters have workers only while there is work. ``late`` is called if it takes long."""
     from distributed import TimeoutError as Late
 
-    address = client.scheduler.address if client.scheduler else "?"
-    nobody = ValueError(f"scheduler: no worker has joined {address}: dask worker {address} starts one")
+    name = ("torch_ecc.first", secrets.token_hex(4))
     try:
-        client.wait_for_workers(1, timeout=PATIENCE)
-    except Late:
-        raise nobody from None
+        first = client.submit(bool, key=name, pure=False)
+        try:
+            first.result(timeout=PATIENCE)
+        except Late:
+            late()
+            first.result()
+    except CancelledError as error:
+        raise ConnectionError("scheduler: it is gone") from error
+
+
+class Guard:
+    """Knows the workers of ``client`` that have been looked at; others may join at any time."""
+
+    def __init__(self, client: Client, out: Path, say: Callable[[str], None]) -> None:
+        self.client, self.out, self.say = client, out, say
+        self.known = set(client.nthreads())
+
+    def __call__(self) -> None:
+        """Send those away that have joined and do not fit: they would be done with everything in no time."""
+        now = set(self.client.nthreads())
+        for worker, seen in _seen(self.client, self.out, list(now - self.known)).items():
+            if wrong := _misfit(worker, seen, self.out):
+                self.say(f"Sent away: {wrong}")
+                self.client.retire_workers([worker])
+        self.known = now
+
+
+def _seen(client: Client, out: Path, workers: list[str]) -> dict[str, Any]:
+    """What those of ``workers`` say that have not left."""
+    if not workers:
+        return {}
     probe = out / WORK / f"probe-{secrets.token_hex(4)}"
     probe.write_text(probe.name)
     try:
-        found = client.run(_look, str(probe), on_error="return")
+        found = client.run(_look, str(probe), workers=workers, on_error="return")
     finally:
         probe.unlink()
-    found = {worker: seen for worker, seen in found.items() if not isinstance(seen, OSError)}  # those have left
-    if not found:
-        raise nobody
-    for worker, seen in found.items():
-        _check_worker(worker, seen, out)
-    if gpu and not any(GPU in seen["resources"] for seen in found.values()):
-        raise ValueError(f"device: no worker has the resource {GPU}: dask worker {address} --resources {GPU}=1")
+    return {worker: seen for worker, seen in found.items() if not isinstance(seen, OSError)}
 
 
 def _look(probe: str, dask_worker: Any) -> dict[str, Any]:
@@ -133,16 +187,18 @@ def _look(probe: str, dask_worker: Any) -> dict[str, Any]:
     return {"versions": versions(), "seen": seen, "resources": list(dask_worker.state.total_resources)}
 
 
-def _check_worker(worker: str, seen: Any, out: Path) -> None:
+def _misfit(worker: str, seen: Any, out: Path) -> str | None:
+    """What is wrong with a worker; None if nothing is."""
     if isinstance(seen, ModuleNotFoundError):
-        raise ValueError(f"scheduler: the worker {worker} cannot import torch_ecc ({seen}): install it there, too")
+        return f"scheduler: the worker {worker} cannot import torch_ecc ({seen}): install it there, too"
     if isinstance(seen, BaseException):
-        raise ValueError(f"scheduler: the worker {worker} fails: {seen}")
+        return f"scheduler: the worker {worker} fails: {seen}"
     if not same_versions(seen["versions"], here := versions()):
         told = " and ".join(f"{name} {seen['versions'].get(name)} (here: {here[name]})" for name in DECIDING)
-        raise ValueError(f"scheduler: the worker {worker} has {told}: results would depend on who makes them")
+        return f"scheduler: the worker {worker} has {told}: results would depend on who makes them"
     if not seen["seen"]:
-        raise ValueError(f"out: the worker {worker} does not see {out}: choose a folder that all computers share")
+        return f"out: the worker {worker} does not see {out}: choose a folder that all computers share"
+    return None
 
 
 def dashboard_of(client: Client) -> str | None:

@@ -43,7 +43,7 @@ PERIOD = 1.0  # s between two words of a worker
 
 
 class Withdrawn(Exception):  # noqa: N818 - nothing went wrong
-    """Nobody waits for this work any more."""
+    """Nobody waits for this work any more, or not for that of this worker."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,11 @@ def told(work: Work, make: Callable[[], Row]) -> Row:
         check_versions(work.versions)
         with one_thread():
             return make()
-    except Withdrawn:
-        return row_of(work, UNFINISHED)
-    except Exception as error:  # a recording that fails is a row, whatever a library has stumbled on
+    except Withdrawn as why:
+        return row_of(work, UNFINISHED, words=str(why))
+    except (Exception, SystemExit) as error:  # a recording that fails is a row, whatever a library has stumbled on
         lasting = isinstance(error, ValueError | FileNotFoundError)
-        words = str(error).strip() or type(error).__name__
+        words = repr(error) if isinstance(error, SystemExit) else str(error).strip() or type(error).__name__
         return row_of(work, FAILED, words=words) | {"lasting": lasting, "inputs": inputs_of(work)}
 
 
@@ -148,11 +148,11 @@ def same_versions(a: dict[str, str], b: dict[str, str]) -> bool:
 
 
 def check_versions(wanted: dict[str, str]) -> None:
-    """ValueError if this worker has others."""
+    """Withdrawn if this worker has others."""
     here = versions()
     if not same_versions(here, wanted):
         told = ", ".join(f"{name} {here[name]} (wanted: {wanted.get(name)})" for name in DECIDING)
-        raise ValueError(f"versions: they must be equal everywhere; a worker has {told}")
+        raise Withdrawn(f"versions: they must be equal everywhere; a worker has {told}")
 
 
 def inputs_of(work: Work) -> list[list[Any]]:
