@@ -90,8 +90,8 @@ def solve_again(
         return judge(reference, there, pose, settings, origin, push), there
     with torch.no_grad():
         there = found(reference, image.detach(), pose.detach(), settings, memory)
-    attached = implicit.attached(reference, image, pose, there, settings)
-    return judge(reference, attached, pose, settings, origin, push), there
+    seen, attached = implicit.attached(reference, image, pose, there, settings)
+    return judge(seen, attached, pose, settings, origin, push), there
 
 
 def found(

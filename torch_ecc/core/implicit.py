@@ -20,18 +20,23 @@ The start has no share in a pose that was found.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.autograd.function import once_differentiable
 
-from torch_ecc.core.criteria import safe_inverse
+from torch_ecc.core.criteria import ECC, safe_inverse
+from torch_ecc.core.normal import Normal
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference, each, reweigh
 from torch_ecc.core.sampling import inside, is_cpu, make_sampler
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution, counted_pixels, summed
+
+Gradients = Sequence[Tensor | None]
 
 
 def wanted(reference: Reference, image: Tensor, start: Tensor) -> bool:
@@ -40,57 +45,131 @@ def wanted(reference: Reference, image: Tensor, start: Tensor) -> bool:
     return some and torch.is_grad_enabled()
 
 
-def attached(reference: Reference, image: Tensor, start: Tensor, found: Solution, settings: Settings) -> Solution:
+def attached(
+    reference: Reference, image: Tensor, start: Tensor, found: Solution, settings: Settings
+) -> tuple[Reference, Solution]:
     """What an engine has ``found`` of B templates in (B or 1, 1, H, W) from ``start`` (B, 3) on, its numbers as they
-    are, with the gradients that they have at that place. Those of templates without a solution are 0."""
-    warp, pixels = reference.warps(found.pose), reference.grid.pixels
-    visible, trusted = in_sight(reference, warp, image), believed(reference, found)
+    are, with the gradients that they have at that place, and the ``reference`` to judge it by. Those of templates
+    without a solution are 0."""
+    visible, trusted = in_sight(reference, reference.warps(found.pose), image), believed(reference, found)
     counted = counted_pixels(reference, visible, trusted)
     seen = reference if counted is None else reweigh(reference, counted)
-    sample = make_sampler(settings.interpolation, image.to(seen.K.dtype), warp, reference.grid.box)
-    g, slopes = sample(warp, pixels), along_pose(sample.slopes(warp, pixels), warp, found.pose, pixels)
-    inverse, solved = inverse_slope(seen, g, slopes, turn(found.pose[:, 2]))
-    g = only(solved, g, g.detach())
-    if seen.K.requires_grad:
-        seen = each(lambda v: only(solved, v, v.detach()), seen._replace(coarse=None))
-    pose = root(found.pose, start, seen.criterion.step(seen, g).to(found.pose.dtype), inverse)
-    moved = (pose - pose.detach()).to(g.dtype)  # 0, with a gradient
-    g = torch.baddbmm(g.unsqueeze(1), moved.unsqueeze(1), slopes).squeeze(1)
-    weight = reference.weight if visible is None else reference.weight * visible
-    sums = summed(seen, g, weight, trusted)
-    look = Solution(pose, found.error, found.iterations, *sums, seen.normal, found.trust, found.odd)
-    return each(lambda value, slope: value if slope is value else carried(value, slope), found, look)
+    in_view = reference.weight if visible is None else reference.weight * visible
+    template = Template(seen.K, seen.signal, seen.weight, in_view)
+    place = Place(each(torch.Tensor.detach, seen._replace(coarse=None)), found, trusted, settings.interpolation)
+    of_template = seen.normal if seen.K.requires_grad else ()
+    pose, gain, sums, total, *normal = answered(place, image, start, *template, *of_template)
+    found = found._replace(pose=pose, gain=gain, sums=sums, total=total)
+    if not normal:
+        return reference, found
+    found = found._replace(normal=Normal(*normal))
+    return (reference.judged_by(found.normal) if counted is None else reference), found
 
 
-class _Root(torch.autograd.Function):
-    """The ``pose`` (B, 3) at which the ``increment`` (B, 3) is 0, given the inverse (B, 3, 3) of its slope there."""
+class Template(NamedTuple):
+    """What of a ``reference.Reference`` has gradients: ``K`` and ``signal``, the ``weight`` (B, N) of the pixels that
+    count, and that of those ``seen``, see ``solution.summed``."""
+
+    K: Tensor
+    signal: Tensor
+    weight: Tensor
+    seen: Tensor
+
+
+class Place(NamedTuple):
+    """Where templates were ``found``: the ``reference`` of the pixels that count there, how far their blocks are
+    ``trusted`` (B, blocks), and what samples the image."""
+
+    reference: Reference
+    found: Solution
+    trusted: Tensor | None
+    interpolation: str
+
+    def of(self, template: Template) -> Reference:
+        """The reference of a ``template``."""
+        columns = self.reference.columns._replace(signal=template.signal, weight=template.weight)
+        return self.reference._replace(K=template.K, columns=columns)
+
+    def sums(self, g: Tensor, *template: Tensor) -> Sequence[Tensor]:
+        """``solution.summed`` of the patches ``g`` (B, N)."""
+        given = Template(*template)
+        return summed(self.of(given), g, given.seen, self.trusted)
+
+    def increment(self, g: Tensor, *template: Tensor) -> Sequence[Tensor]:
+        """That which the criterion asks for, (B, 3)."""
+        reference = self.of(Template(*template))
+        return (reference.criterion.step(reference, g),)
+
+
+class _Answer(torch.autograd.Function):
+    """Pose, gain and sums of templates found in an ``image`` at a ``Place``, and their normal equations if these have
+    gradients too."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, pose: Tensor, start: Tensor, increment: Tensor, inverse: Tensor) -> Tensor:
-        ctx.save_for_backward(inverse)
-        return pose.clone()
+    def forward(place: Place, image: Tensor, start: Tensor, *template: Tensor) -> tuple[Tensor, ...]:
+        found = place.found
+        numbers = found.pose, found.gain, found.sums, found.total, *found.normal
+        return tuple(number.clone() for number in numbers[: len(template)])  # as many of the normal equations
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.place, image, _, *template = inputs
+        ctx.save_for_backward(image, *template[: len(Template._fields)])
+        ctx.set_materialize_grads(False)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        (inverse,) = ctx.saved_tensors  # type: ignore[attr-defined]
-        return None, torch.zeros_like(gradient), -(inverse.mT @ gradient.unsqueeze(2)).squeeze(2), None
+    def backward(ctx: Any, by_pose: Tensor | None, *by_sums: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, *template = ctx.saved_tensors
+        by_image, by_template = gradients(ctx.place, image, template, by_pose, by_sums)
+        return None, by_image, torch.zeros_like(ctx.place.found.pose), *by_template
 
 
-class _Carried(torch.autograd.Function):
-    """A ``value`` as it is, with the gradient of another one of its shape."""
-
-    @staticmethod
-    def forward(ctx: FunctionCtx, value: Tensor, other: Tensor) -> Tensor:
-        return value.clone()
-
-    @staticmethod
-    def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[None, Tensor]:
-        return None, gradient
+answered: Callable[..., tuple[Tensor, ...]] = _Answer.apply
 
 
-root: Callable[..., Tensor] = _Root.apply
-carried: Callable[[Tensor, Tensor], Tensor] = _Carried.apply
+def gradients(
+    place: Place, image: Tensor, template: Sequence[Tensor], by_pose: Tensor | None, by_sums: Gradients
+) -> tuple[Tensor | None, Gradients]:
+    """By the ``image``, the ``template`` and its normal equations, of those by the pose (B, 3), by what
+    ``solution.summed`` gives, and by these equations.
+
+    With one look at the patches, and what leads back from them to the image: never one at more than their
+    neighbourhoods.
+    """
+    reference, pixels = place.reference, place.reference.grid.pixels
+    pose, (by_sums, by_normal) = place.found.pose, (by_sums[:3], by_sums[3:])
+    warp = reference.warps(pose)
+    sample = make_sampler(place.interpolation, image.to(reference.K.dtype), warp, reference.grid.box)
+    g, slopes, by_values = sample.linearised(warp, pixels)
+    slopes = along_pose(slopes, warp, pose, pixels)
+    U = slope_of_step(reference, g)
+    inverse, solved = inverse_slope(U, slopes, turn(pose[:, 2]))
+    by_g, *by_look = pulled(place.sums, (g.requires_grad_(), *template), by_sums)
+    g, by_g = g.detach(), torch.zeros_like(g) if by_g is None else by_g
+    v = (slopes @ by_g[:, :, None])[:, :, 0].to(inverse.dtype)
+    less = -((v if by_pose is None else v + by_pose)[:, None] @ inverse)
+    by_step = pulled(partial(place.increment, g), template, (less[:, 0].to(g.dtype),))
+    by_g = torch.baddbmm(by_g[:, None], less.to(g.dtype), U)[:, 0]
+    by_template = [added(solved, *both) for both in (*zip(by_look, by_step, strict=True), *((v,) for v in by_normal))]
+    if not image.requires_grad:
+        return None, by_template
+    return sample.by_image(by_values(only(solved, by_g, torch.zeros_like(g))), image), by_template
+
+
+def pulled(function: Callable[..., Sequence[Tensor]], at: Sequence[Tensor], by: Gradients) -> list[Tensor | None]:
+    """The gradients by those arguments of a ``function`` that ask for some, ``at`` their values, from those ``by`` what
+    it gives."""
+    leaves = [value.detach().requires_grad_(value.requires_grad) for value in at]
+    asked = [leaf for leaf in leaves if leaf.requires_grad]
+    if not asked or all(value is None for value in by):
+        return [None] * len(at)
+    with torch.enable_grad():
+        values, given = zip(
+            *(pair for pair in zip(function(*leaves), by, strict=True) if pair[1] is not None), strict=True
+        )
+    found = iter(torch.autograd.grad(values, asked, given, allow_unused=True))
+    return [next(found) if leaf.requires_grad else None for leaf in leaves]
 
 
 def in_sight(reference: Reference, warp: Tensor, image: Tensor) -> Tensor | None:
@@ -116,17 +195,30 @@ def along_pose(slopes: Tensor, warp: Tensor, pose: Tensor, pixels: Tensor) -> Te
     return torch.stack((gx, gy, gx * y - gy * x), 1)  # eq. (2): d(x, y) / dtheta = (y, -x)
 
 
-def inverse_slope(reference: Reference, g: Tensor, slopes: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """A^-1 (B, 3, 3) at patches ``g`` (B, N) with ``slopes`` (B, 3, N) along poses with ``axes`` (B, 3, 3), see
-    ``pose.turn``, 0 where there is no solution; and where (B,) there is one."""
+def slope_of_step(reference: Reference, g: Tensor) -> Tensor:
+    """U (B, 3, N) at patches ``g`` (B, N): by how much an increment changes with each pixel of the patch."""
+    if type(reference.criterion) is ECC:  # of b / a
+        of_b, of_a = reference.K.narrow(1, 0, 3), reference.K.narrow(1, 3, 1)
+        increment, a = reference.criterion.step(reference, g)[:, :, None], of_a @ (g - g[:, :1])[:, :, None]
+        return torch.baddbmm(of_b, increment, of_a, alpha=-1).div_(a)
+    g = g.detach().requires_grad_()
     with torch.enable_grad():
-        g = g.detach().requires_grad_()
-        increment = reference.criterion.step(reference, g)
-        rows = [torch.autograd.grad(row.sum(), g, retain_graph=True)[0] for row in increment.unbind(1)]
-    slope = (torch.stack(rows, 1) @ slopes.mT).to(axes.dtype) @ axes  # in the template's axes it is about 1
-    inverse, regular = safe_inverse(slope)
-    solved = regular & increment.isfinite().all(1)
+        rows = [row.sum() for row in reference.criterion.step(reference, g).unbind(1)]
+    return torch.stack([torch.autograd.grad(row, g, retain_graph=True)[0] for row in rows], 1)
+
+
+def inverse_slope(U: Tensor, slopes: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """A^-1 (B, 3, 3) of patches with ``slopes`` (B, 3, N) along poses with ``axes`` (B, 3, 3), see ``pose.turn``, 0
+    where there is no solution; and where (B,) there is one."""
+    slope = (U @ slopes.mT).to(axes.dtype) @ axes  # in the template's axes it is about 1
+    inverse, solved = safe_inverse(slope)
     return only(solved, axes @ inverse, torch.zeros_like(inverse)), solved
+
+
+def added(some: Tensor, *gradients: Tensor | None) -> Tensor | None:
+    """The sum of ``gradients`` of templates (B, ...), 0 but for ``some`` (B,)."""
+    there = [gradient for gradient in gradients if gradient is not None]
+    return only(some, sum(there[1:], there[0]), torch.zeros_like(there[0])) if there else None
 
 
 def only(some: Tensor, value: Tensor, other: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import chain
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -178,8 +178,16 @@ class Reference(_Groups):
     def distorted(self, distortion: Tensor | None) -> Reference:
         """The same templates, seen with another ``distortion`` (B, 2, 2)."""
         coarse = None if self.coarse is None else self.coarse.distorted(distortion)
-        other = self._replace(coarse=coarse, distortion=distortion)
-        other.__dict__ = self.__dict__  # what is made once depends on no distortion
+        return self._like(coarse=coarse, distortion=distortion)
+
+    def judged_by(self, normal: Normal) -> Reference:
+        """The same templates with ``normal`` equations of the same numbers, but with other gradients."""
+        return self._like(normal=normal)
+
+    def _like(self, **changed: Any) -> Reference:
+        """The same but for what nothing depends on that is made once."""
+        other = self._replace(**changed)
+        other.__dict__ = self.__dict__
         return other
 
     def select(self, index: Tensor | slice) -> Reference:
@@ -349,7 +357,8 @@ def _coarser(reference: Reference) -> Reference | None:
 
 def _sparsest(reference: Reference) -> int:
     """Px between pixels of which so few still tell where to go: noise moves the farthest one by as many times more."""
-    shift = (2 * reference.noise.power * (reference.normal.white * reference.place.lever2).sum(1)).sqrt()
+    white = reference.normal.white.detach()
+    shift = (2 * reference.noise.power * (white * reference.place.lever2).sum(1)).sqrt()
     most = float(torch.where(shift <= FAINT, shift, 0.0).max())  # what is not found with all pixels does not count
     return SPARSEST if most * SPARSEST <= FAINT else int(FAINT / most)
 

@@ -105,14 +105,32 @@ class Sampler(NamedTuple):
         """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside, its border repeats."""
         return self._at(self._points(warp, pixels))
 
-    def slopes(self, warp: Tensor, pixels: Tensor) -> Tensor:
-        """d/dx and d/dy of these values, per px of the frame: (B, 2, N). Where they have a kink, as bilinear ones have
-        on the pixels, those to the right and down."""
+    def linearised(self, warp: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
+        """These values (B, N), their d/dx and d/dy (B, 2, N) per px of the frame, and what takes a gradient by them to
+        that by ``self.values``. Where they have a kink, as bilinear ones have on the pixels, slopes are those to the
+        right and down."""
         with torch.enable_grad():
-            points = self._points(warp, pixels).detach().requires_grad_()
-            values = self._replace(values=self.values.detach())._at(points)
-        (slopes,) = torch.autograd.grad(values.sum(), points)
-        return slopes if self.kernel.ring else slopes * self._scale().to(slopes.dtype)
+            values, points = (v.detach().requires_grad_() for v in (self.values, self._points(warp, pixels)))
+            g = self._replace(values=values)._at(points)
+        (slopes,) = torch.autograd.grad(g, points, torch.ones_like(g), retain_graph=True)
+        slopes = slopes if self.kernel.ring else slopes * self._scale().to(slopes.dtype)
+        return g.detach(), slopes, lambda by_value: torch.autograd.grad(g, values, by_value)[0]
+
+    def by_image(self, by_values: Tensor, image: Tensor) -> Tensor:
+        """The gradient by the ``image`` (I, 1, H, W) that it was made of, from that by its ``values``: the transpose of
+        ``make_sampler``."""
+        ring = self.kernel.ring
+        if ring:
+            given = self.kernel.taps, ring, by_values.dtype, by_values.device
+            rows, columns = (_prefilter_matrix(n - 2 * ring, *given) for n in by_values.shape[-2:])
+            by_values = rows.mT @ by_values @ columns
+        if by_values.shape == image.shape:
+            return by_values
+        total, (h, w) = image.new_zeros(image.shape, dtype=by_values.dtype), by_values.shape[-2:]
+        corners = (self.origin + ring).long().tolist()
+        for frame, (x, y), part in zip(cycle(total), corners, by_values, strict=False):
+            frame[:, y : y + h, x : x + w] += part
+        return total
 
     def _scale(self) -> Tensor:
         h, w = self.values.shape[-2:]
@@ -220,8 +238,9 @@ def _to_unit(h: int, w: int, device: torch.device) -> Tensor:
 
 def _lookup(image: Tensor, points: Tensor) -> Tensor:
     """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, 2, N): (B, N). Its border repeats."""
-    image = image if len(image) == len(points) else image.expand(len(points), -1, -1, -1)
-    grid = points.mT.unsqueeze(1)
+    grid, alone = points.mT.unsqueeze(1), len(image) == 1 and image.requires_grad  # else its gradient is B images
+    grid = grid.transpose(0, 1) if alone else grid
+    image = image if len(image) == len(grid) else image.expand(len(grid), -1, -1, -1)
     values = F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)
     return values.view(len(points), -1)
 

@@ -79,8 +79,8 @@ def known_of(reference: Reference, normal: Normal, interpolation: str) -> Known:
 
 
 def known(reference: Reference, normal: Normal, interpolation: str) -> Known:
-    """The same; made once where all pixels count."""
-    if normal is not reference.normal or torch.compiler.is_compiling():
+    """The same; made once where all pixels count and nobody asks for its gradients."""
+    if normal is not reference.normal or normal.bread.requires_grad or torch.compiler.is_compiling():
         return known_of(reference, normal, interpolation)
     kept = reference.verdicts
     if interpolation not in kept:

@@ -62,23 +62,31 @@ def level(frame, x, y):
 
 @triton.jit
 def sampled(frame, warp, x, y):
-    """The frame at x', y', float32; its border repeats. Coordinates count from a whole pixel near the template's
-    centre, and stay small."""
-    ring: tl.constexpr = frame.of.DEGREE // 2  # of values around the frame, and taps before the pixel behind a point
+    """The frame at x', y', float32; of no meaning where that is out of sight. Coordinates count from a whole pixel near
+    the template's centre, and stay small."""
     left, top = tl.floor(near(warp.x0, frame.of.width)), tl.floor(near(warp.y0, frame.of.height))
     px = warp.xu.to(tl.float32) * x + warp.xv.to(tl.float32) * y + (warp.x0 - left).to(tl.float32)
     py = warp.yu.to(tl.float32) * x + warp.yv.to(tl.float32) * y + (warp.y0 - top).to(tl.float32)
-    of_x, of_y = taps(px - tl.floor(px), frame.of.DEGREE), taps(py - tl.floor(py), frame.of.DEGREE)
-    column, row = tl.floor(px).to(tl.int32) + left.to(tl.int32), tl.floor(py).to(tl.int32) + top.to(tl.int32)
-    width, height = frame.of.width + 2 * ring, frame.of.height + 2 * ring
-    g = tl.zeros_like(x)
+    column, of_x = placed(px, left.to(tl.int32), frame.of.width, frame.of.DEGREE)
+    row, of_y = placed(py, top.to(tl.int32), frame.of.height, frame.of.DEGREE)
+    pitch = frame.of.width + frame.of.DEGREE // 2 * 2
+    g, first = tl.zeros_like(x), frame.grey + (row * pitch + column)
     for j in tl.static_range(frame.of.DEGREE + 1):
-        line, of_row = tl.zeros_like(x), tl.minimum(tl.maximum(row + j, 0), height - 1) * width
+        line = tl.zeros_like(x)
         for i in tl.static_range(frame.of.DEGREE + 1):
-            at = of_row + tl.minimum(tl.maximum(column + i, 0), width - 1)
-            line += of_x[i] * tl.load(frame.grey + at).to(tl.float32)
+            line += of_x[i] * tl.load(first + i).to(tl.float32)
         g += of_y[j] * line
+        first += pitch
     return g
+
+
+@triton.jit
+def placed(p, start, size, DEGREE: tl.constexpr):
+    """The first tap around coordinates from ``start`` on, among values that go on for a ring beyond ``size``, and the
+    weights of all: the first one is clamped once, so that the others lie beside it, on the last pixel too."""
+    most = size + (DEGREE // 2) * 2 - 1 - DEGREE
+    first = tl.minimum(tl.maximum(tl.floor(p).to(tl.int32) + start, 0), most)
+    return first, taps(p - (first - start).to(tl.float32), DEGREE)
 
 
 @triton.jit
