@@ -2,7 +2,8 @@
 
 ``python benchmarks/live.py [--seconds N] [--camera WIDTHxHEIGHT@HZ] [--patches N] [--only alone page]
 [--out FILE.json]``: a run of ``torch-ecc track camera:test:...`` in one process with whatever shows it. The page is a
-real browser's (Chromium through playwright), which draws pictures and curves of the run on the same machine.
+real browser's (Chromium through playwright), which draws pictures and curves of the run on the same machine. Latency is
+told twice: from when a picture was read, and from the beat of the camera, which counts how late it was read too.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 from results import save
 
-from torch_ecc.commands.live import PERCENTILES
+from torch_ecc.commands.live import PERCENTILES, Latency
 from torch_ecc.paper.result import Number
 from torch_ecc.view.desk import Desk
+from torch_ecc.view.history import History
 from torch_ecc.view.server import Server
 
 SIZE = 121  # px
@@ -52,23 +55,29 @@ def browser(url: str) -> Iterator[None]:
         opened.close()
 
 
-def measure(desk: Desk) -> tuple[list[float], int, int]:
-    """Latencies in ms, frames lost and frames tracked of a whole run."""
+def measure(desk: Desk) -> tuple[History, Latency, float]:
+    """The rows and the latencies of a whole run, and the seconds of a processor that this process took for it."""
+    begun = time.process_time()
     desk.track()
     while desk.running:
         time.sleep(0.5)
     run = desk.run
     if run is None or run.state != "done":
         raise SystemExit(f"the run failed: {run and run.words}")
-    return run.latency.milliseconds(), run.latency.lost, len(run.history)
+    return run.history, run.latency, time.process_time() - begun
 
 
-def numbers(name: str, found: tuple[list[float], int, int]) -> Iterator[Number]:
-    """As records, which are printed too."""
-    latency, lost, frames = found
-    for share, ms in zip(PERCENTILES, latency, strict=True):
-        yield Number(f"{name}: latency, {share:g} %", ms, "ms")
-    yield Number(f"{name}: frames lost of {lost + frames}", lost, "frames")
+def numbers(name: str, hz: float, found: tuple[History, Latency, float]) -> Iterator[Number]:
+    """As records."""
+    history, latency, busy = found
+    number, time_s = history.rows[:, :2].T
+    late = time_s - number / hz  # but for when the camera began: no picture is read before it is there
+    seconds = np.array(latency.seconds)
+    for kind, each in (("reading", seconds), ("the beat", seconds + late - late.min())):
+        for share, ms in zip(PERCENTILES, 1e3 * np.percentile(each, PERCENTILES), strict=True):
+            yield Number(f"{name}: latency from {kind}, {share:g} %", ms, "ms")
+    yield Number(f"{name}: frames lost of {latency.lost + len(history)}", latency.lost, "frames")
+    yield Number(f"{name}: processor of this process", busy / (time_s[-1] - time_s[0]), "cores")
 
 
 def main() -> None:
@@ -91,7 +100,8 @@ def main() -> None:
                     found = measure(desk)
             else:
                 found = measure(desk)
-        for record in numbers(f"{given.camera}, {given.patches} patches, {kind}", found):
+        hz = float(given.camera.split("@")[1])
+        for record in numbers(f"{given.camera}, {given.patches} patches, {kind}", hz, found):
             print(f"{record.name}: {record.value:.3g} {record.unit}", flush=True)
             records.append(record)
     if given.out:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import socket
+import threading
 import time
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from torch_ecc.commands.jobs import TrackJob
 from torch_ecc.commands.live import Latency, sender
 from torch_ecc.commands.track import Session
 from torch_ecc.io import open_frames
+from torch_ecc.io.cameras import newest
 from torch_ecc.io.cameras.newest import Newest, Shot
 from torch_ecc.io.cameras.test_pattern import moved, open_test
 from torch_ecc.io.frames import Arrival, Frame
@@ -34,23 +36,71 @@ def _closed():
     close_cameras()
 
 
-def test_a_frame_that_nobody_takes_gives_way_to_the_next():
-    """What is missed is counted, by the camera's own numbers or by how many came."""
-    for numbered in (True, False):
-        numbers = iter([0, 1, 2, 3, 4, 7, 8, None])
+def fed(numbers, numbered: bool = True) -> Newest:
+    """A camera that has read all of these pictures before the first of them is grabbed."""
+    numbers, done = iter([*numbers, None]), threading.Event()
 
-        def read(numbers=numbers, numbered=numbered):
-            number = next(numbers)
-            time.sleep(0.01)
-            return None if number is None else (np.full((4, 6), number, np.uint8), number if numbered else None)
+    def read():
+        number = next(numbers)
+        return None if number is None else (np.full((4, 6), number, np.uint8), number if numbered else None)
 
-        camera = Newest(read)
-        first = camera.grab()
-        time.sleep(0.2)  # all others come in the meantime
-        last = camera.grab()
-        assert (first.pixels[0, 0], first.number, first.lost) == (0, 0, 0)
-        assert (last.pixels[0, 0], last.lost) == (8, 7 if numbered else 5)
-        assert camera.grab() is None
+    camera = Newest(read, done.set)
+    threading.Thread(target=camera._go_on, daemon=True).start()
+    camera._thread = threading.current_thread()  # it is running
+    assert done.wait(20)
+    return camera
+
+
+def grabbed(camera: Newest) -> list[tuple[int, int]]:
+    """The pictures and the losses of all that is left."""
+    return [(int(shot.pixels[0, 0]), shot.lost) for shot in iter(camera.grab, None)]
+
+
+def test_a_moment_is_waited_for_and_what_is_missed_is_counted():
+    """A few pictures wait; who is slower than the camera gets the newest. By the camera's own numbers, or as many as
+    came."""
+    assert grabbed(fed([0, 1, 2, 5, 6])) == [(0, 0), (1, 0), (2, 0), (5, 2), (6, 0)]
+    assert grabbed(fed([0, 1, 2, 5, 6], numbered=False)) == [(0, 0), (1, 0), (2, 0), (5, 0), (6, 0)]
+    assert grabbed(fed(range(50))) == [(49, 0)]  # nobody has grabbed at all
+    camera = Newest(lambda: None)
+    for number in range(3):
+        camera._append(Shot(np.full((1, 1), number), number, 0.0, 0))
+    camera._thread = threading.current_thread()
+    assert camera.grab().number == 0
+    camera._append(Shot(np.full((1, 1), 3), 3, 1.0, 0))  # a second later nobody wants those before
+    assert camera.grab()[1:] == (3, 1.0, 2)
+    for number in range(4, 20):
+        camera._append(Shot(np.full((1, 1), number), number, 1.0, 0))
+    assert camera.grab()[1:] == (19, 1.0, 15)
+    camera._append(Shot(np.full((1, 1), 20), 20, 1.0, 0))
+    camera._append(Shot(np.full((1, 1), 21), 21, 1.0, 0))
+    assert [camera.grab().number for _ in range(2)] == [20, 21]  # it keeps them again
+
+
+def test_a_silent_camera_is_told_not_waited_for(monkeypatch, tmp_path):
+    """A cable is out: what came before is kept, and whoever wants to stop is not kept waiting."""
+    out, numbers, silent = tmp_path / "out", itertools.count(), threading.Event()
+    picture = PlaneWaves.random(seed=2).render(torch.tensor([[45.0, 40.0, 0.0]]).double(), (80, 90))[0, 0].numpy()
+
+    def read():
+        number = next(numbers)
+        if number == 4:
+            silent.wait(20)
+            return None
+        return picture, number
+
+    monkeypatch.setattr(newest, "SILENCE_S", 0.3)
+    camera = Newest(read)
+    job = TrackJob(input="a camera", centers=((45.0, 40.0),), size=31, out=str(out), overlay=False)
+    with pytest.raises(ValueError, match=r"the camera has sent no picture for 0\.3 s"):
+        Session(job, camera).run()
+    assert len(np.load(out / "track.npz")["frame"]) > 0
+    assert camera.ended
+    monkeypatch.undo()
+    closed, waiting = threading.Event(), Newest(lambda: closed.wait(5) and None)
+    threading.Timer(0.05, lambda: (waiting.close(), closed.set())).start()
+    assert waiting.grab() is None
+    silent.set()
 
 
 def test_what_reading_raises_is_raised_to_whoever_grabs():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import socket
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -22,28 +23,42 @@ Send = Callable[[Frame, Estimate], None]
 
 
 class Latency:
-    """Of a camera's frames: from arrival to pose, and how many were ``lost`` because they came too fast."""
+    """Of a camera's frames: the ``seconds`` from arrival to pose, and how many were ``lost``: they came too fast."""
 
     def __init__(self) -> None:
-        self.lost, self._seconds = 0, list[float]()
+        self.lost, self.seconds = 0, list[float]()
 
     def add(self, frame: Frame) -> None:
         """One whose pose is there."""
         if frame.arrival is not None:
             self.lost += frame.arrival.lost
-            self._seconds.append(time.perf_counter() - frame.arrival.time_s)
+            self.seconds.append(time.perf_counter() - frame.arrival.time_s)
 
     def milliseconds(self) -> list[float]:
         """At ``PERCENTILES``; empty if there was no frame of a camera."""
-        return [1e3 * value for value in np.percentile(self._seconds, PERCENTILES)] if self._seconds else []
+        return [1e3 * value for value in np.percentile(self.seconds, PERCENTILES)] if self.seconds else []
 
     def words(self) -> list[str]:
         """The same as a sentence, if there is something to say."""
-        if not self._seconds:
+        if not self.seconds:
             return []
         times = ", ".join(f"{ms:.1f}" for ms in self.milliseconds())
         shares = ", ".join(f"{share:g}" for share in PERCENTILES)
         return [f"{self.lost} frames of the camera were lost; {times} ms from arrival to pose ({shares} %)"]
+
+
+@contextmanager
+def as_it_comes() -> Iterator[None]:
+    """While frames do not wait, until Ctrl-C: how else would a camera end. What libraries have made is not looked
+    through for garbage, 0.1 s in which nothing else is done."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    finally:
+        gc.unfreeze()
 
 
 def sender(address: str, um_matrix: Tensor | None = None) -> Send:

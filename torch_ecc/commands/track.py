@@ -6,7 +6,7 @@ import dataclasses
 import errno
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from torch import Tensor
 from torch_ecc.body.body import Body
 from torch_ecc.commands.bodies import BODY_FILES, read_lens, told, write_bodies
 from torch_ecc.commands.jobs import TrackJob, span
-from torch_ecc.commands.live import Latency, Send, sender
+from torch_ecc.commands.live import Latency, Send, as_it_comes, sender
 from torch_ecc.commands.run import Pictures, Run
 from torch_ecc.commands.templates import Templates, choose_templates, read_frame_mask, read_templates, refuse_doubt
 from torch_ecc.core.ambient import threads_for
@@ -156,7 +156,7 @@ class Session:
             run = self._run(left, films)
             stopped: BaseException | None = None
             try:
-                with run, suppress(*([KeyboardInterrupt] if self.source.live else [])):  # how else would a camera end
+                with run, as_it_comes() if self.source.live else nullcontext():
                     run.through(self._frames(left, pictures=bool(films)), progress, self.send, watch)
             except (KeyboardInterrupt, ValueError) as error:
                 stopped = error

@@ -20,7 +20,7 @@ from torch_ecc.core.frame import as_gray, require_tensor
 from torch_ecc.core.noise import DIM_BLURS, INSTRUMENT_BLUR, LEAST_NOISE, NOISE_SHARE, Noise, blurred
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.patches import QUANTISATION, Size, as_size
-from torch_ecc.core.reference import MARGIN, Grid, Place, Reference, chosen, each
+from torch_ecc.core.reference import MARGIN, NARROW, Grid, Place, Reference, chosen, each
 from torch_ecc.core.sampling import clipped, gradients, noise_samples, pad
 from torch_ecc.core.verdict import predicted_sigma
 
@@ -130,7 +130,7 @@ def _predicted(gray: Tensor, windows: _Windows, rounding: float) -> Tensor:
     level = torch.maximum(_noise(gray, windows), LEAST_NOISE * _contrast(_inner(wide)[0, 0], windows))
     known: Products = {}
     noise, normal = _observed(wide, level, windows, INSTRUMENT_BLUR, known)
-    for wider in DIM_BLURS:
+    for wider in (blur for blur in DIM_BLURS if NARROW * blur < min(windows.size)):
         share = normal.noise_share * noise.power
         if bool((share <= NOISE_SHARE).all()):
             break

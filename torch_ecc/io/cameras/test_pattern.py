@@ -14,6 +14,7 @@ from torch_ecc.io.frames import Pixels
 
 RADIUS = 16  # px
 TURN_S = 2.0
+BUFFERS = 4  # pictures that wait for their reader, as in a driver
 
 
 def open_test(which: str) -> tuple[Newest, float]:
@@ -27,7 +28,7 @@ def open_test(which: str) -> tuple[Newest, float]:
 
     def read() -> tuple[Pixels, int]:
         nonlocal count
-        count = max(count + 1, math.floor((time.perf_counter() - begun) * hz))  # pictures do not wait for their reader
+        count = max(count + 1, math.floor((time.perf_counter() - begun) * hz) - BUFFERS)
         time.sleep(max(begun + (count + 1) / hz - time.perf_counter(), 0.0))
         x, y = moved(count, hz)
         return large[RADIUS - y : RADIUS - y + height, RADIUS - x : RADIUS - x + width].copy(), count
