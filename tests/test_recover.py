@@ -365,13 +365,13 @@ def test_searches_take_no_more_than_their_share(monkeypatch):
     )
     stack, other = still((0, 0, 0), start=(160.0, 120.0, 0.0)), noisy(np.full(FRAME, 90) + 20 * edge(X - 50), RNG)
     counts = {}
-    for share in (0.1, 0.5, 1.0):
+    for share in (0.1, 1.0):
         searched.clear()
         tracker = Tracker(stack[0], [(160.0, 120.0)], 31, search_share=share)
-        reasons = [int(tracker(other).reason) for _ in range(400)]
+        reasons = [int(tracker(other).reason) for _ in range(100)]
         counts[share] = len(searched)
         assert (te.Reason.WAITING in reasons) == (share < 1)
-    assert counts[0.1] < counts[0.5] < counts[1.0]
+    assert counts[0.1] < counts[1.0]
 
 
 def test_what_is_much_like_a_template_but_another_thing_is_strained():

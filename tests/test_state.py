@@ -72,7 +72,7 @@ def assert_goes_on_as(a: Tracker, b: Tracker, frames: Tensor = FRAMES[3:]) -> No
     assert all(map(torch.equal, a.buffers(), b.buffers()))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "backend"), [*((k, "native") for k in KINDS), ("one", "torch"), ("masks", "torch")])
 def test_a_state_makes_another_tracker_this_one(kind: str, backend: str) -> None:
     """A tracker of other patches of another picture goes on as the one whose state it has loaded."""
     options = {"backend": backend, **KINDS[kind]}
