@@ -44,7 +44,8 @@ def data() -> Path:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs leave a blank picture: drawing takes longer than the rest of a short one."""
     blank = cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes()
-    monkeypatch.setattr("torch_ecc.plots.plot_track", lambda track, path, **_: path.write_bytes(blank))
+    for name in ("plots.plot_track", "commands.compare.plot_comparison"):
+        monkeypatch.setattr(f"torch_ecc.{name}", lambda track, path, **_: path.write_bytes(blank))
     monkeypatch.setattr("torch_ecc.plots.body.plot_body", lambda path, *_: path.write_bytes(blank))
 
 
