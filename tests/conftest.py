@@ -6,6 +6,8 @@ import os
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from hypothesis import settings
@@ -36,6 +38,15 @@ def data() -> Path:
     if not (folder / "README.md").is_file():
         pytest.skip(f"real sequences are not at {folder}; TORCH_ECC_DATA names another place")
     return folder
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs leave a blank picture: drawing takes longer than the rest of a short one."""
+    blank = cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes()
+    for name in ("plots.plot_track", "commands.compare.plot_comparison"):
+        monkeypatch.setattr(f"torch_ecc.{name}", lambda track, path, **_: path.write_bytes(blank))
+    monkeypatch.setattr("torch_ecc.plots.body.plot_body", lambda path, *_: path.write_bytes(blank))
 
 
 @pytest.fixture

@@ -49,8 +49,9 @@ def problem(seed: int, count: int = 6):
     return templates, images.round().clamp(0, 255).to(torch.uint8), truth + off * torch.tensor([1.0, 1.0, 0.01])
 
 
-@pytest.mark.parametrize("criterion", ["ecc", "ecc_paper", "ssd"])
-@pytest.mark.parametrize("interpolation", ["bilinear", "bspline3", "bspline5"])
+@pytest.mark.parametrize(
+    ("criterion", "interpolation"), [("ecc", "bspline3"), ("ecc_paper", "bilinear"), ("ssd", "bspline5")]
+)
 def test_nothing_waits_for_the_host(blind, criterion, interpolation):
     templates, images, start = problem(0)
     reference = prepare(templates, criterion=criterion)
@@ -59,8 +60,7 @@ def test_nothing_waits_for_the_host(blind, criterion, interpolation):
     assert found.status.tolist()[-2:] == [Status.LOST, Status.CONVERGED]
 
 
-@pytest.mark.parametrize("scale", [1, 3])
-@pytest.mark.parametrize("interpolation", ["bilinear", "bspline3"])
+@pytest.mark.parametrize(("interpolation", "scale"), [("bilinear", 1), ("bspline3", 1), ("bspline3", 3)])
 def test_it_gives_what_a_cpu_gives(interpolation, scale, request):
     """With a coarser grid first (scale 3) and without, inside the frame and across its border."""
     templates, images, start = problem(1)
@@ -82,7 +82,7 @@ def test_it_gives_what_a_cpu_gives(interpolation, scale, request):
 def test_one_graph_serves_all_frames(blind):
     """Operations recorded on one frame and replayed on another give that frame's poses."""
     templates, images, start = problem(2)
-    reference, settings = prepare(templates), Settings(max_iterations=3, backend="torch")
+    reference, settings = prepare(templates), Settings(max_iterations=1, backend="torch")
 
     def pose_and_status(image, pose):
         found = solve(reference, image, pose, settings)

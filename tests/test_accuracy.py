@@ -26,8 +26,7 @@ SCENE = PlaneWaves.random(count=200, fmax=0.25, rms_gradient=7.0)
 SCENES = {"waves": SCENE, "pads": Pads.wafer()}
 
 
-@pytest.mark.parametrize("turn", [False, True])
-@pytest.mark.parametrize("noise", [0.0, 2.0, 5.0, 10.0])
+@pytest.mark.parametrize(("noise", "turn"), [(0.0, False), (0.0, True), (2.0, True), (5.0, False), (10.0, True)])
 def test_scatter_reaches_the_bound_and_the_covariance_says_so(noise, turn):
     count = 200
     found = scatter(SCENE, Draws(noise, count, turn, seed=int(noise)))
@@ -42,11 +41,10 @@ def test_scatter_reaches_the_bound_and_the_covariance_says_so(noise, turn):
     assert (found.error.mean(0).abs() < 0.4 * found.bound).all(), found.error.mean(0) / found.bound
 
 
-@pytest.mark.parametrize("noise", [5.0, 10.0])
-def test_flat_areas_do_not_add_scatter(noise):
+def test_flat_areas_do_not_add_scatter():
     """Pads are mostly flat: there a noisy template's gradients are nothing but noise."""
     count = 200
-    found = scatter(Pads.wafer(), Draws(noise, count, seed=int(noise)))
+    found = scatter(Pads.wafer(), Draws(10.0, count, seed=10))
     chance = 1 + 2.5 / math.sqrt(2 * count)
     assert (found.ratio <= 1.1 * chance).all(), found.ratio
     assert 0.8 / chance**2 < float(found.nees.mean()) < 1.25 * chance**2
@@ -55,7 +53,7 @@ def test_flat_areas_do_not_add_scatter(noise):
 @pytest.mark.parametrize("turn", [False, True])
 @pytest.mark.parametrize("scene", SCENES)
 def test_unrounded_the_tracker_is_exact(scene, turn):
-    error = scatter(SCENES[scene], Draws(0.0, 100, turn, bits=None)).error.abs().amax(0)
+    error = scatter(SCENES[scene], Draws(0.0, 40, turn, bits=None)).error.abs().amax(0)
     assert error[:2].max() < 0.001
     assert error[2] < math.radians(0.001)
 
@@ -138,17 +136,17 @@ def test_two_full_turns():
 
 
 @pytest.mark.parametrize(
-    ("light", "method", "largest_px", "largest_deg"),
+    ("light", "methods", "largest_px", "largest_deg"),
     [
-        (GradientLight(scale_px=640), "ecc, linear", 0.003, 0.003),
-        (GradientLight(scale_px=640), "ecc, quadratic", 0.003, 0.003),
-        (SpotLight(scale_px=640), "ecc, quadratic", 0.01, 0.015),
+        (GradientLight(scale_px=640), ("ecc, linear", "ecc, quadratic"), 0.003, 0.003),
+        (SpotLight(scale_px=640), ("ecc, quadratic",), 0.01, 0.015),
     ],
 )
-def test_light_that_varies_across_the_template(light, method, largest_px, largest_deg):
-    runs = under_light(SCENE, light, Harmonic(50.0, 10.0, 30))
-    assert runs[method].lost == 0
-    assert runs[method].largest[0] < largest_px
-    assert runs[method].largest[1] < largest_deg
-    for plain in ("ssd", "ecc, gain", "ecc_paper"):  # what the columns are for
-        assert runs[plain].largest[0] > 3 * runs[method].largest[0]
+def test_light_that_varies_across_the_template(light, methods, largest_px, largest_deg):
+    runs = under_light(SCENE, light, Harmonic(50.0, 10.0, 24))
+    for method in methods:
+        assert runs[method].lost == 0
+        assert runs[method].largest[0] < largest_px
+        assert runs[method].largest[1] < largest_deg
+        for plain in ("ssd", "ecc, gain", "ecc_paper"):  # what the columns are for
+            assert runs[plain].largest[0] > 3 * runs[method].largest[0]

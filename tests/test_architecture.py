@@ -43,11 +43,25 @@ def imports(path: Path) -> set[tuple[str, ...]]:
     return found
 
 
+def of_every(paths: list[Path]):
+    """One test of them all: to report hundreds takes longer than to read the files."""
+
+    def made(check):
+        def test() -> None:
+            for path in paths:
+                check(path)
+
+        test.__doc__ = check.__doc__
+        return test
+
+    return made
+
+
 def rank(name: str) -> int:
     return next(k for k, floor in enumerate(FLOORS) if name in floor)
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+@of_every(FILES)
 def test_imports_go_one_way(path):
     me, *_ = parts(path)
     if me in {"__init__", "__main__"}:
@@ -62,7 +76,7 @@ def test_imports_go_one_way(path):
             assert rank(other) < rank(me), f"{me} must not import {other}"
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+@of_every(FILES)
 def test_rooms_stand_on_one_another(path):
     me, *room = parts(path)
     order = ROOMS.get(me, [])
@@ -99,7 +113,7 @@ def test_names_come_when_they_are_used():
         _ = torch_ecc.trakcer
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+@of_every(FILES)
 def test_files_and_functions_stay_small(path):
     text = path.read_text()
     assert len(text.splitlines()) <= 400
@@ -119,7 +133,7 @@ def test_the_public_names_exist():
         assert getattr(torch_ecc, name).__doc__, name
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if parts(p)[0] == "core"], ids=lambda p: p.name)
+@of_every([path for path in FILES if parts(path)[0] == "core"])
 def test_the_core_is_plain_torch(path):
     """Without numpy, and without types that say nothing."""
     for node in ast.walk(ast.parse(path.read_text())):

@@ -65,6 +65,7 @@ def test_one_body(video, tmp_path):
     assert (out / "overlay.mp4").is_file()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_two_bodies_and_what_one_does_as_seen_from_the_other(video, tmp_path):
     job = TrackJob(input=str(video / "two.npy"), grid=6, size=41, bodies=1, out=str(tmp_path), overlay=False)
     finished = Session(job).run()
@@ -77,6 +78,7 @@ def test_two_bodies_and_what_one_does_as_seen_from_the_other(video, tmp_path):
         assert float(row["sigma_relative_theta_rad"]) > float(row["sigma_theta_rad"])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_lens_is_told_to_the_simulator_and_to_the_track(tmp_path):
     """What the one bends the other straightens, from numbers and from a file; without it the body is far off."""
     config = {
@@ -98,6 +100,7 @@ def test_a_lens_is_told_to_the_simulator_and_to_the_track(tmp_path):
     assert errors[1] == pytest.approx(errors[2], abs=0.1)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_it_goes_on_where_it_was_stopped(video, tmp_path):
     """With body and overlay, as if nothing had happened."""
     whole, parts = (

@@ -7,7 +7,6 @@ import json
 import math
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import click
@@ -48,10 +47,10 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 def test_the_version_tells_the_engine():
     """Which instructions, or why there is none."""
-    done = run("--version")
-    assert done.returncode == 0
+    done = CliRunner().invoke(app, ["--version"])
+    assert done.exit_code == 0
     version, engine = f"torch-ecc {torch_ecc.__version__}, torch {torch.__version__}", library.describe()
-    assert done.stdout == f"{version}, engine: {engine}\n"
+    assert done.output == f"{version}, engine: {engine}\n"
     assert engine.startswith("native, ") == (library.load() is not None)
 
 
@@ -221,13 +220,11 @@ def test_a_damaged_frame_keeps_what_came_before(tmp_path):
     assert (tmp_path / "o" / "track.png").exists()
 
 
-def test_help_is_quick_and_names_the_commands():
-    started = time.perf_counter()
-    shown = run("--help")
-    assert time.perf_counter() - started < 20
-    assert shown.returncode == 0
-    assert "demo" in shown.stdout
-    assert "track" in shown.stdout
+def test_help_names_the_commands_and_brings_nothing_that_draws_or_reads():
+    code = "import sys; from torch_ecc.cli import app; app(['--help'], standalone_mode=False); print(*sys.modules)"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {"demo", "track"} <= set(shown)
+    assert not {"matplotlib", "cv2", "av", "dask"} & set(shown)
 
 
 def test_simulate_and_track_what_was_simulated(tmp_path):

@@ -134,6 +134,7 @@ SENSES = {
 }
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("signs", SENSES)
 def test_axes_that_count_the_other_way_are_found_and_said(signs, tmp_path):
     turned = SENSES[signs]

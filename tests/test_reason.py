@@ -144,7 +144,7 @@ def test_a_frame_that_nobody_sees_is_damaged():
 def test_every_reason_goes_with_one_status(backend):
     """Over random problems of every kind; and nothing that converged has one."""
     draw, told = random.Random(5), set()
-    for _ in range(150 if backend == "native" else 40):
+    for _ in range(100 if backend == "native" else 30):
         problem = Problem.drawn(draw)
         reference, image, start = problem.made(draw.choice(CRITERIA))
         found = align(reference, image, start, backend=backend, max_iterations=draw.choice([1, 15]))

@@ -25,6 +25,7 @@ from torch_ecc.sim.scene.waves import PlaneWaves
 
 FRAMES, DIES = 60, 37
 posix = pytest.mark.skipif(os.name == "nt", reason="signals")
+undrawn = pytest.mark.usefixtures("undrawn")
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +89,7 @@ def dying(video: Path, out: Path, how: str) -> subprocess.Popen[str]:
 
 
 @posix
+@undrawn
 def test_killed_and_resumed(video, whole, tmp_path):
     """kill -9: only parts are left, they hold every frame, and the rest is tracked as if nothing had happened."""
     process = dying(video, tmp_path, "os.kill(os.getpid(), signal.SIGKILL)")
@@ -106,6 +108,7 @@ def test_killed_and_resumed(video, whole, tmp_path):
 
 
 @pytest.mark.parametrize("stage", ["half a row", "half a record", "half a picture", "no picture"])
+@undrawn
 def test_resumed_whatever_is_half_there(video, whole, tmp_path, stage):
     stop_at(video, tmp_path, 30)
     (tmp_path / "track.csv").rename(tmp_path / "track.csv.part")
@@ -128,6 +131,7 @@ def stop_at(video: Path, out: Path, frame: int, **options: object) -> None:
     assert Session(job(video, out, **options)).run(step).interrupted
 
 
+@undrawn
 def test_stopped_twice_and_resumed(video, whole, tmp_path):
     """What was done has its final names in between, and says that it is not all."""
     stop_at(video, tmp_path, 22)  # in the middle of the frames without the patch
@@ -141,6 +145,7 @@ def test_stopped_twice_and_resumed(video, whole, tmp_path):
     assert_same(tmp_path, whole)
 
 
+@undrawn
 def test_what_is_resumed_must_be_the_same_run(video, tmp_path):
     stop_at(video, tmp_path, 10)
     with pytest.raises(ValueError, match=r"resume: levels was 1 in the run in .*, and is 2 now"):
@@ -154,6 +159,7 @@ def test_what_is_resumed_must_be_the_same_run(video, tmp_path):
         Session(job(tmp_path / "video.npy", tmp_path / "out", resume=True)).run()
 
 
+@undrawn
 def test_records_of_another_version_are_not_misread(video, tmp_path):
     stop_at(video, tmp_path, 10)
     records = tmp_path / "track.records.part"
@@ -163,6 +169,7 @@ def test_records_of_another_version_are_not_misread(video, tmp_path):
     assert Session(job(video, tmp_path, force=True)).run().frames == FRAMES
 
 
+@undrawn
 def test_resume_without_anything_to_resume_begins(video, whole, tmp_path):
     Session(job(video, tmp_path / "out", resume=True)).run()
     assert_same(tmp_path / "out", whole)
@@ -270,6 +277,7 @@ def assert_whole(folder: Path) -> None:
     assert not names & {"track.npz.part", "overlay.mp4.part", "track.png.part"}
 
 
+@undrawn
 def test_disk_full_in_the_middle_of_a_frame(video, whole, tmp_path, monkeypatch):
     written, plain = [0], output.append
 
@@ -292,6 +300,7 @@ def test_disk_full_in_the_middle_of_a_frame(video, whole, tmp_path, monkeypatch)
 
 
 @posix
+@undrawn
 def test_two_at_once(video, tmp_path):
     process = dying(video, tmp_path, "print('there', flush=True); time.sleep(600)")
     assert process.stdout.readline() == "there\n", process.stderr.read()
@@ -303,6 +312,7 @@ def test_two_at_once(video, tmp_path):
     assert Session(job(video, tmp_path, resume=True)).run().frames == FRAMES  # a dead one holds nothing
 
 
+@undrawn
 def test_a_result_is_not_overwritten(video, tmp_path):
     Session(job(video, tmp_path)).run()
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -345,6 +355,7 @@ def test_the_folder_is_named_after_the_input(tmp_path, monkeypatch):
 # ---- frames that are damaged, and some frames only -----------------------------------------------------------------
 
 
+@undrawn
 def test_damaged_frames_are_rows(tmp_path):
     """Of another size, with NaN: the run goes on, and the neighbours are as they would have been."""
     frames = np.stack(
@@ -374,6 +385,7 @@ def test_damaged_frames_are_rows(tmp_path):
     assert json.loads((tmp_path / "old way" / "summary.json").read_text())["frames"] == 3
 
 
+@undrawn
 def test_some_frames(video, tmp_path):
     """They keep their numbers and times; a run of them can be resumed too."""
     Session(job(video, tmp_path / "a", frames="30:50:4")).run()

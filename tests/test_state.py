@@ -72,7 +72,7 @@ def assert_goes_on_as(a: Tracker, b: Tracker, frames: Tensor = FRAMES[3:]) -> No
     assert all(map(torch.equal, a.buffers(), b.buffers()))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "backend"), [*((k, "native") for k in KINDS), ("one", "torch"), ("masks", "torch")])
 def test_a_state_makes_another_tracker_this_one(kind: str, backend: str) -> None:
     """A tracker of other patches of another picture goes on as the one whose state it has loaded."""
     options = {"backend": backend, **KINDS[kind]}
@@ -192,9 +192,9 @@ def test_a_criterion_of_ones_own_is_known_by_its_class() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda tracker: pickle.loads(pickle.dumps(tracker))])
-def test_a_copy_goes_on_by_itself(copied, kind: str, backend: str) -> None:
+def test_a_copy_goes_on_by_itself(copied, kind: str) -> None:
     """A deep copy and a pickle tell the same of the next frames, and neither moves the other."""
-    tracker = used(backend=backend, **KINDS[kind])
+    tracker = used(**KINDS[kind])
     twin, before = copied(tracker), frozen(tracker)
     assert twin.settings == tracker.settings
     assert twin.prediction == tracker.prediction
