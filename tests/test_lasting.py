@@ -13,7 +13,8 @@ from torch import Tensor
 from torch_ecc import Status, Tracker
 from torch_ecc.core.reference import MARGIN
 from torch_ecc.sim import PlaneWaves
-from torch_ecc.track.lessons import Lessons
+from torch_ecc.track.ages import placed
+from torch_ecc.track.lessons import AGES, Lessons, shifted
 
 FRAME, SIZE = (110, 120), 61
 START = (60.0, 54.0)
@@ -107,7 +108,7 @@ def test_what_does_not_change_stays_where_it_is() -> None:
     assert int(tracker.lesson_rounds) == 40
     drift = pose[100:].mean(0) - pose[5:105].mean(0)
     assert float(drift[:2].abs().max()) < 2e-3
-    assert not bool(tracker.lesson_origin.equal(tracker.template))
+    assert int(tracker.lesson_held) == AGES
 
 
 @pytest.mark.parametrize("level", [0.0, 240.0])
@@ -194,4 +195,30 @@ def test_who_learns_nothing_holds_nothing() -> None:
     """A tracker that is not told to learn has no such state."""
     names = dict(Tracker(film(1, 2.0)[0], [START], SIZE).named_buffers())
     assert not any(name.startswith("lesson") for name in names)
-    assert len(Lessons._fields) == 13
+    assert len(Lessons._fields) == 14
+
+
+def test_what_is_new_does_not_feign_a_shift_once_it_has_been_seen() -> None:
+    """Means of a surface that becomes another one, each off its place: all of them together find the places back, to
+    better than one of them and the first one alone."""
+    old, new = (PlaneWaves.random(seed=k).render(path(1), FRAME)[:, :, 10:98, 16:104] for k in (3, 53))
+    share = torch.arange(8).view(8, 1, 1, 1) / 10
+    noise = 0.5 * torch.randn(8, 1, 88, 88, generator=torch.Generator().manual_seed(1))
+    off = 0.02 * torch.arange(8)[:, None].double() * torch.tensor((1.0, -0.7, 3e-3)).double() / 7
+    images = shifted((1 - share) * old + share * new + noise, "bspline3", -off, off[:, :2] * 0)[:, 0]
+    counted, centre = torch.ones(1, 1, 88, 88), torch.zeros(1, 2)
+
+    def last(which: list[int]) -> tuple[Tensor, Tensor]:
+        """By how much the last one of them is off after a few passes, and sigma."""
+        some, total = images[which], off.new_zeros(len(which), 3)
+        for _ in range(5):
+            there = torch.ones(1, len(which), dtype=torch.bool)
+            found = placed(some[None], there, torch.tensor([0.25]), counted, centre)
+            some = shifted(some[:, None], "bspline3", found.step[0], total[:, :2] * 0)[:, 0]
+            total = total + found.step[0]
+        return (total[-1] - off[-1])[:2], found.covariance[0, -1].diagonal()[:2].sqrt()
+
+    error, sigma = last(list(range(8)))
+    alone, _ = last([0, 7])
+    assert float(error.norm()) < 0.5 * float(alone.norm())
+    assert float((error / sigma).abs().max()) < 3

@@ -1,9 +1,8 @@
 """Templates that last: the first one as the mean of some frames, and made anew, slowly, of surfaces that change.
 
 A template that follows its surface must not drift off it. Every new one is the mean of frames placed by the last one,
-and is then put where the first mean has it, or, once their textures have become too unlike, where an anchor in between
-has it: nothing adds up but what the surface itself has lost. How much that is, the first mean tells, for as long as it
-is like the last one at all.
+and is then put where the means before it have it, some of all ages, the first one among them for as long as it is like
+the last one at all (``track.ages``): nothing adds up but what the surface itself has lost.
 """
 
 from __future__ import annotations
@@ -24,12 +23,15 @@ from torch_ecc.core.pose import rotation
 from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.sampling import SAMPLERS, inside, make_sampler
 from torch_ecc.core.sight import eroded, picked
-from torch_ecc.track.surface import Comparison, Surface, compare, news, pixels, with_contrast
+from torch_ecc.track.ages import Places, placed
+from torch_ecc.track.surface import Surface, news, pixels, with_contrast
 
 HIGH = 0.75  # coverage: with less a frame teaches nothing
 SHARE = 0.5  # of a round's frames must have shown a pixel: else it stays what it was
-ALIKE = 0.9  # correlation: a template less like its anchor is the next anchor
+AGES = 7  # older means that are kept
 UNLIKE = 0.2  # correlation: the first mean tells nothing of a template less like it
+PASSES = 3  # in which means are placed among each other
+AT_ONCE = 4  # templates that are renewed together
 FEWEST = 2  # frames of a round
 FEWEST_EVEN = 5  # frames that tell how it has moved in them
 CHANCE = 6.0  # over the square root of frames: so much more than noise may be noise
@@ -45,9 +47,11 @@ class Lessons(NamedTuple):
     sum, and ``times`` (R, 1, h, w) each, how many frames; how many ``learned`` (R,) from in this round, and how many
     ``rounds`` (R,) there have been; the template's ``noise`` (R,) at first, and of how many ``frames`` (R,) it is the
     mean now; of the first round the sums of poses from the start (R, 3, 3): of p, p times the number of the frame, and
-    p^2, the ``moves``, and what they leave of one frame's scatter in where the template lies, the ``share`` (R,); the
-    first mean, the ``origin``, and the ``anchor``, (R, 1, h, w) each; covariances (R, 3, 3), in the
-    template's axes, of the ``origin_place``, the template's own, ``place``, and what renewals have corrected, ``lag``.
+    p^2, the ``moves``, and what they leave of one frame's scatter in where the template lies, the ``share`` (R,); means
+    of all ages, the ``older`` (R, AGES, h, w), of which so many are ``held`` (R,), the oldest first; covariances
+    (R, 3, 3), in the template's axes, of the place of that one, ``oldest``, the template's own, ``place``, and what
+    renewals have corrected, ``lag``; and by how much (R, 3) what is new in a round is expected to drag poses along, the
+    ``lead`` that the template is given over that.
     """
 
     fresh: Tensor
@@ -58,11 +62,12 @@ class Lessons(NamedTuple):
     frames: Tensor
     moves: Tensor
     share: Tensor
-    origin: Tensor
-    anchor: Tensor
-    origin_place: Tensor
+    older: Tensor
+    held: Tensor
+    oldest: Tensor
     place: Tensor
     lag: Tensor
+    lead: Tensor
 
     @staticmethod
     def begin(template: Tensor, noise: Tensor, pose: Tensor) -> dict[str, Tensor]:
@@ -73,7 +78,8 @@ class Lessons(NamedTuple):
         counts = one.long(), torch.zeros_like(one).long()
         moves, *places = (place.clone() for _ in range(4))
         more = noise.clone(), one.clone(), moves, one.clone()
-        values = *images, *counts, *more, template.clone(), template.clone(), *places
+        ages = template.repeat(1, AGES, 1, 1), torch.zeros_like(one).long()
+        values = *images, *counts, *more, *ages, *places, torch.zeros_like(pose)
         return dict(zip(LESSONS, values, strict=True))
 
 
@@ -168,7 +174,9 @@ class Teacher:
         lessons.moves.index_add_(0, which, torch.stack((moved, numbered, moved * moved), 1))
         done = which[lessons.learned[which] >= lengths[which]]
         if len(done) > 0:
-            self.renew(done, estimate.sigma[done], crop, lessons)
+            for some in done.split(AT_ONCE):
+                self.renew(some, estimate.sigma[some], crop, lessons)
+            self.surface = None
         return done
 
     def learn(self, image: Tensor, warp: Tensor, which: Tensor, crop: Crop, lessons: Lessons) -> None:
@@ -193,58 +201,68 @@ class Teacher:
         if self.surface is not None and self.surface.columns.shape[1] > 3:
             # A gain by least squares is too small by the template's noise, and round after round that would add up.
             mean = with_contrast(mean, old, crop.mask[which] * enough)
-        later = lessons.rounds[which] > 0
-        if bool(later.any()):
-            moved = self.anchored(which, torch.where(enough, mean, old), enough, crop, lessons)
-            mean = torch.where(later[:, None, None, None], moved, mean)
-        else:
-            offset, lessons.share[which] = at_first(lessons.moves[which], lessons.learned[which], sigma)
-            mean = shifted(mean, self.interpolation, offset, crop.centre[which])
+        first = lessons.rounds[which] == 0
+        offset, share = at_first(lessons.moves[which], lessons.learned[which], sigma)
+        lessons.share[which] = torch.where(first, share, lessons.share[which])
+        mean = shifted(mean, self.interpolation, torch.where(first[:, None], offset, 0.0), crop.centre[which])
         new = torch.where(enough, mean, old)
+        if self.rounds[1] > 0:
+            placed = self.among_older(which, new, enough, crop, lessons)
+            new = torch.where(enough, shifted(placed, self.interpolation, lessons.lead[which], crop.centre[which]), old)
         crop.template[which] = new
-        for image in (lessons.origin, lessons.anchor):
-            image[which] = torch.where(later[:, None, None, None], image[which], new)
         lessons.frames[which] = lessons.learned[which].to(lessons.frames)
         lessons.rounds[which] += 1
         for counted in (lessons.fresh, lessons.times, lessons.learned):
             counted[which] = 0
-        self.surface = None
 
-    def anchored(self, which: Tensor, mean: Tensor, enough: Tensor, crop: Crop, lessons: Lessons) -> Tensor:
-        """New means (n, 1, h, w) of the templates at ``which`` (n,), put where the first ones or their anchors are."""
-        first, near = (self.compared(k, mean, enough, which, crop, lessons) for k in (lessons.origin, lessons.anchor))
-        alike = first.correlation >= ALIKE
-        step = torch.where(alike[:, None], first.step, near.step).nan_to_num(0.0, 0.0, 0.0)
-        moved = shifted(mean, self.interpolation, step, crop.centre[which])
-        anchor = torch.where((near.correlation < ALIKE)[:, None, None, None], moved, lessons.anchor[which])
-        lessons.anchor[which] = torch.where(alike[:, None, None, None], lessons.origin[which], anchor)
-        self.trust(which, first, step, lessons)
-        gone = which[first.correlation < UNLIKE]  # from now on the anchor is what there is
-        lessons.origin[gone], lessons.origin_place[gone] = moved[first.correlation < UNLIKE], lessons.place[gone]
-        lessons.anchor[gone] = lessons.origin[gone]
-        return moved
+    def among_older(self, which: Tensor, new: Tensor, enough: Tensor, crop: Crop, lessons: Lessons) -> Tensor:
+        """The ``new`` means (n, 1, h, w) of the templates at ``which`` (n,) put where the older ones have them, and
+        these where all of them have each other."""
+        images, step = torch.cat((lessons.older[which], new), 1), torch.zeros_like(lessons.lag[which, 0])
+        noise, there = lessons.noise[which].square() / lessons.learned[which], present(lessons.held[which])
+        counted, centre = crop.mask[which] * enough, crop.centre[which]
+        for _ in range(PASSES):
+            found = placed(images, there, noise, counted, centre)
+            off, about = found.step.nan_to_num(0.0, 0.0, 0.0), centre.repeat_interleave(AGES + 1, 0)
+            each = shifted(images.flatten(0, 1)[:, None], self.interpolation, off.flatten(0, 1), about)
+            images, step = each.view_as(images), step + off[:, -1]
+        trust(which, step, found.covariance[:, -1], lessons)
+        remember(which, images, there, found, lessons)
+        return images[:, -1:]
 
-    def compared(
-        self, image: Tensor, mean: Tensor, enough: Tensor, which: Tensor, crop: Crop, lessons: Lessons
-    ) -> Comparison:
-        """New means (n, 1, h, w) with an older ``image`` (R, 1, h, w) of the templates at ``which`` (n,)."""
-        surface = Surface.of(self.criterion, image[which], crop.mask[which], crop.centre[which])
-        noise = 2 * lessons.noise[which].square() / lessons.learned[which]  # theirs and these
-        return compare(self.criterion, surface, mean.flatten(1), enough.flatten(1), noise)
 
-    def trust(self, which: Tensor, first: Comparison, step: Tensor, lessons: Lessons) -> None:
-        """What is known of the places of the templates at ``which`` (n,) after a ``step`` (n, 3).
+def trust(which: Tensor, step: Tensor, covariance: Tensor, lessons: Lessons) -> None:
+    """What is known of the places of the templates at ``which`` (n,), which have been put right by a ``step`` (n, 3)
+    with a ``covariance`` (n, 3, 3) as against the oldest mean."""
+    rounds, square = lessons.rounds[which][:, None, None], step[:, :, None] * step[:, None]
+    # What was new in the first round has dragged its mean along, too, by half as much as in the second one.
+    lessons.oldest[which] += torch.where(rounds == 1, square / 4, 0.0)
+    place = lessons.oldest[which] + covariance
+    lessons.place[which] = torch.where(place.isfinite(), place, lessons.place[which])
+    share = torch.where(rounds > 0, 1 / rounds.clamp(min=1, max=SOME), 0.0).to(step)
+    lessons.lag[which] = torch.lerp(lessons.lag[which], square, share)
+    lessons.lead[which] += share[:, 0] * step
 
-        The share of its texture that is the ``first`` one's is the cosine of an angle, what is new its sine. The way
-        by anchors is as long as the angle: so much more than what the sine feigns.
-        """
-        angle = first.correlation.clamp(0, 1).arccos()
-        longer = torch.where(angle > 0.1, angle / angle.sin(), 1.0)[:, None, None]
-        place = lessons.origin_place[which] + longer.square() * first.covariance
-        known = place.isfinite().all(2, keepdim=True).all(1, keepdim=True)
-        lessons.place[which] = torch.where(known, place, lessons.place[which])
-        share = 1 / lessons.rounds[which].clamp(max=SOME)[:, None, None]
-        lessons.lag[which] = torch.lerp(lessons.lag[which], step[:, :, None] * step[:, None], share.to(step))
+
+def present(held: Tensor) -> Tensor:
+    """Which of the older means, and a new one, there are, (n, AGES + 1) bool, if so many are ``held`` (n,)."""
+    older = torch.arange(AGES, device=held.device) < held[:, None]
+    return torch.nn.functional.pad(older, (0, 1), value=True)
+
+
+def remember(which: Tensor, images: Tensor, there: Tensor, found: Places, lessons: Lessons) -> None:
+    """Of the ``images`` (n, AGES + 1, h, w) that are ``there``, (n, AGES + 1) bool, all are kept but the first one,
+    once it is not alike to the last one any more; and, of too many, that whose neighbours are most alike."""
+    number = torch.arange(AGES + 1, device=there.device)
+    gone = found.alike[:, 0, -1] < UNLIKE
+    least = found.alike.diagonal(offset=2, dim1=1, dim2=2).argmax(1, keepdim=True) + 1
+    dropped = torch.where(gone[:, None], number == 0, there.all(1, keepdim=True) & (number == least))
+    stay = there & ~dropped
+    order = (number + len(number) * ~stay).argsort(1)[:, :AGES]
+    moved = lessons.oldest[which] + found.covariance.gather(1, order[:, :1, None, None].expand(-1, -1, 3, 3))[:, 0]
+    lessons.oldest[which] = torch.where(moved.isfinite(), moved, lessons.oldest[which])
+    lessons.older[which] = images.gather(1, order[:, :, None, None].expand(-1, -1, *images.shape[2:]))
+    lessons.held[which] = stay.sum(1)
 
 
 def at_first(moves: Tensor, frames: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:

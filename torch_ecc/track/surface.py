@@ -69,16 +69,6 @@ class Surface(NamedTuple):
         return values.reshape(*values.shape[:2], *self.size)
 
 
-class Comparison(NamedTuple):
-    """How far images lie from a surface: the ``step`` (B, 3) of its pose, px, px, rad; the ``covariance`` (B, 3, 3) of
-    what all that is new in them would feign if the surface were whole, both in its axes; and the ``correlation`` (B,)
-    that is left when light and pose are fitted."""
-
-    step: Tensor
-    covariance: Tensor
-    correlation: Tensor
-
-
 def pixels(template: Tensor) -> Tensor:
     """Those of images (B, 1, h, w), homogeneous, from their middle: (3, h w)."""
     axes = (torch.arange(n, device=template.device, dtype=template.dtype) - (n - 1) / 2 for n in template.shape[2:])
@@ -125,64 +115,3 @@ def variance(values: Tensor, weight: Tensor) -> Tensor:
     total = weight.sum(1, keepdim=True).clamp(min=LEAST)
     mean = (values * weight).sum(1, keepdim=True) / total
     return (weight * (values - mean).square()).sum(1, keepdim=True) / total
-
-
-def compare(criterion: Criterion, surface: Surface, g: Tensor, counted: Tensor, noise: Tensor) -> Comparison:
-    """Images ``g`` (B, N) with a surface, over the pixels ``counted`` (B, N); of what is left, white noise has the
-    variance ``noise`` (B,)."""
-    plain = surface.counting(surface.weight * counted)
-    residual, _ = criterion.fit(plain, g)
-    power, texture = spectrum(plain, residual), spectrum(plain, plain.signal[:, 3])
-    # Where the texture is nothing but noise it would only add scatter.
-    whitening = ((1 - texture.amin((1, 2), keepdim=True) / texture) / power).sqrt()
-    whitening = whitening / whitening.amax((1, 2), keepdim=True)
-    white = filtered(transform(plain, plain.columns * plain.weight[:, None]), whitening)
-    inverse = safe_inverse((white @ white.mT).to(pose_dtype(g.device)))[0].to(g.dtype)
-    twice = filtered(torch.fft.fft2(white.view(*white.shape[:2], *power.shape[1:])), whitening, plain.size)
-    weighed = plain._replace(K=inverse @ twice * plain.weight[:, None])
-    left = criterion.fit(weighed, g).residual * plain.weight
-    influence = inverse[:, :3] @ white * filtered(transform(plain, left[:, None]), whitening)
-    covariance = scatter(weighed, power, influence)
-    changed = (variance(residual, plain.weight)[:, 0] - noise.to(residual)).clamp(min=0)
-    alike = (1 - changed / variance(g, plain.weight)[:, 0].clamp(min=LEAST)).clamp(min=0).sqrt()
-    return Comparison(criterion.step(weighed, g).to(covariance), covariance, alike)
-
-
-def transform(surface: Surface, values: Tensor) -> Tensor:
-    """Fourier transform of ``values`` (B, k, N), continued by zeros to a size that is quick: (B, k, h', w')."""
-    h, w = (-(-n // QUICK) * QUICK for n in surface.size)
-    transformed: Tensor = torch.fft.fft2(surface.images(values), s=(h, w))
-    return transformed
-
-
-def filtered(transformed: Tensor, response: Tensor, size: tuple[int, int] | None = None) -> Tensor:
-    """What was ``transformed`` (B, k, h', w'), times a ``response`` (B, h', w') over the frequency: (B, k, h' w'), or
-    (B, k, h w) of images of ``size`` (h, w)."""
-    h, w = size or response.shape[1:]
-    values: Tensor = torch.fft.ifft2(transformed * response[:, None]).real
-    return values[..., :h, :w].flatten(2)
-
-
-def spectrum(surface: Surface, values: Tensor) -> Tensor:
-    """Power (B, h', w') of ``values`` (B, N), per pixel, smoothed over SMOOTH frequencies in x and y; nowhere less than
-    a small part of its largest."""
-    hann = (torch.hann_window(n, periodic=False, dtype=values.dtype, device=values.device) for n in surface.size)
-    window = surface.weight * torch.outer(*hann).flatten()
-    mean = (values * window).sum(1, keepdim=True) / window.sum(1, keepdim=True).clamp(min=LEAST)
-    power = transform(surface, ((values - mean) * window)[:, None]).abs().square()
-    power = F.avg_pool2d(F.pad(power, (SMOOTH // 2,) * 4, mode="circular"), SMOOTH, 1)[:, 0]
-    power = power / window.square().sum(1)[:, None, None].clamp(min=LEAST)
-    return power.maximum(DARKEST * power.amax((1, 2), keepdim=True)).clamp(min=LEAST)
-
-
-def scatter(weighed: Surface, power: Tensor, influence: Tensor) -> Tensor:
-    """Covariance (B, 3, 3) of an increment: by a residual with a spectrum ``power`` (B, h', w'), or, of a component in
-    which that makes more, by the ``influence`` (B, 3, h' w') of one that clings together in blocks, rows or columns."""
-    rows = transform(weighed, weighed.K[:, :3])
-    covariance = ((rows * power[:, None]).flatten(2) @ rows.flatten(2).mH).real / power[0].numel()
-    there = influence.view_as(rows)
-    across, down = (there.sum(dim).square().sum(-1) for dim in (2, 3))
-    blocks = (F.avg_pool2d(there, CLUSTER, ceil_mode=True, divisor_override=1)).square().sum((2, 3))
-    most = torch.maximum(blocks, torch.maximum(across, down))
-    factor = (most / covariance.diagonal(dim1=1, dim2=2).clamp(min=LEAST)).clamp(min=1).sqrt()
-    return (covariance * factor[:, :, None] * factor[:, None, :]).to(pose_dtype(power.device))
