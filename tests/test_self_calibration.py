@@ -123,6 +123,14 @@ def test_one_direction_tells_what_it_tells(tracker):
     assert fit.sigma["k1"] < 1e-3
 
 
+def test_a_command_that_was_not_obeyed_is_named(tracker):
+    moved = path("circle", 6)
+    sent = STAGE.to_physical(moved)[:, :2]
+    sent[2] += sent.norm(dim=1).max()
+    with pytest.raises(ValueError, match="do not tell .*commanded positions do not fit, number 2 of .* is off by"):
+        calibrate(seen(tracker, moved), sent, tracker=tracker, lens=[])
+
+
 def test_wrong_calls(tracker):
     track = seen(tracker, path("circle", 5))
     for call, message in (

@@ -34,6 +34,7 @@ UNITS = {"k1": 0.01, "k2": 0.01, "p1": 0.01, "p2": 0.01, "center_x": 0.1, "cente
 LEAST_RELATIVE = 0.1  # of a scale, and of an angle in rad: known no better is not known
 FAR_UM = 1e6  # of the offset between two origins: whatever it is
 LEAST_SPREAD = 0.01  # of the longest moves: across them, less tells nothing to begin with
+FAR_OFF = 0.05  # of the longest move: a commanded position so far off is told
 TAKES_PART = 0.3  # of a direction of unit length
 MOST = 60  # frames, evenly spread, that are compared
 STEPS = 12
@@ -184,9 +185,20 @@ def _solved(problem: _Problem) -> SelfCalibration:
     if told:
         raise ValueError(
             f"calibrate: these moves do not tell {', nor '.join(told)}: move far over the view, in more than one "
-            "direction, and turn; or ask for less"
+            f"direction, and turn; or ask for less{_not_obeyed(problem, state)}"
         )
     return _described(problem, state, spread)
+
+
+def _not_obeyed(problem: _Problem, state: _State) -> str:
+    """What is to be said of commanded moves."""
+    _, sent = _residuals(problem, state.q, state.body, 1.0)
+    if not sent.shape[1]:
+        return ""
+    way = problem.commanded.nan_to_num(0.0).norm(dim=1).max()
+    off, number = sent.norm(dim=1).max(0)
+    words = f"; commanded positions do not fit, number {int(number)} of those compared is off by {float(off):.3g} um"
+    return words if off > FAR_OFF * way else ""
 
 
 def _step(problem: _Problem, factor: Tensor, state: _State) -> tuple[Tensor, list[str]]:

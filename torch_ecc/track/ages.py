@@ -86,7 +86,7 @@ def placed(images: Tensor, there: Tensor, noise: Tensor, counted: Tensor, centre
 
 def inner(counted: Tensor) -> Tensor:
     """By how much pixels count (B, 1, h, w), less and less towards where they do not."""
-    near = F.avg_pool2d(F.pad(counted, (EDGE // 2,) * 4), EDGE, 1)
+    near = F.avg_pool2d(F.avg_pool2d(F.pad(counted, (EDGE // 2,) * 4), (EDGE, 1), 1), (1, EDGE), 1)
     return counted * (2 * near / near.amax((2, 3), keepdim=True).clamp(min=LEAST) - 1).clamp(min=FAINT)
 
 
