@@ -35,6 +35,7 @@ from torch_ecc.io.summary import versions
 from torch_ecc.sim.scene.waves import PlaneWaves
 
 distributed = pytest.importorskip("distributed")
+dask = pytest.importorskip("dask")
 
 SETTINGS = {"centers": [(48.0, 40.0)], "size": 31}
 FRAMES = 8
@@ -189,8 +190,14 @@ class Deadly:
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_a_killed_worker_is_replaced(tmp_path):
-    deadly = {"a": Deadly(tmp_path / "killed")}
-    done = te.batch(deadly, tmp_path / "out", workers=1, overlay=False, **SETTINGS)
+    """However long that takes: Dask would give up one that is not there again after 15 s."""
+    films, lost = {"a": Deadly(tmp_path / "killed")}, []
+
+    def progress(done: int, of: int | None) -> None:
+        lost.append(dask.config.get("distributed.deploy.lost-worker-timeout"))
+
+    done = te.batch(films, tmp_path / "out", workers=1, progress=progress, overlay=False, **SETTINGS)
+    assert set(lost) == {"1 day"}
     assert (tmp_path / "killed").exists()
     assert statuses(done) == {"a": "tracked"}
     assert not (tmp_path / "out" / WORK).exists()
