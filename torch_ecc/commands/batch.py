@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from torch_ecc.commands.batch_cluster import (
-    Guard,
     check_cluster,
     connected,
     cores,
@@ -214,11 +213,11 @@ class _Run:
         return connected(self.job.scheduler, min(most, len(self.todo) * self.job.parts), gpu=self.gpu)
 
     def _use(self, cluster: Client, queue: Queue, say: Say) -> None:
-        check_cluster(cluster, self.folder, say, gpu=self.gpu)
+        guard = check_cluster(cluster, self.folder, say, gpu=self.gpu)
         if link := dashboard_of(cluster):
             say(f"Dask's dashboard: {link}")
         cluster.subscribe_topic(self.ticket, self.tally.hear)
-        queue.run(cluster, self._withdraw, Guard(cluster, self.folder, say))
+        queue.run(cluster, self._withdraw, guard)
 
     def _tasks(self) -> Iterator[Task]:
         for work in self.todo:

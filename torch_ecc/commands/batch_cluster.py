@@ -10,6 +10,7 @@ import sys
 from asyncio import CancelledError
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from importlib.util import find_spec
 from multiprocessing import current_process
 from pathlib import Path
@@ -119,9 +120,9 @@ def cores() -> int:
     return int(CPU_COUNT)
 
 
-def check_cluster(client: Client, out: Path, say: Callable[[str], None], *, gpu: bool) -> None:
-    """Wait until there is a worker. ValueError, in words, for a cluster with workers of other versions, without a GPU
-    where one is wanted, or that do not see the folder ``out``."""
+def check_cluster(client: Client, out: Path, say: Callable[[str], None], *, gpu: bool) -> Guard:
+    """Wait until there is a worker; what it gives looks at those that come later. ValueError, in words, for a cluster
+    with workers of other versions, without a GPU where one is wanted, or that do not see the folder ``out``."""
     address = client.scheduler.address if client.scheduler else "?"
     _wait_for_one(client, lambda: say(f"No worker has joined {address} yet: dask worker {address} starts one. Waiting"))
     found = _seen(client, out, list(client.nthreads()))
@@ -130,6 +131,7 @@ def check_cluster(client: Client, out: Path, say: Callable[[str], None], *, gpu:
             raise ValueError(wrong)
     if gpu and not any(GPU in seen["resources"] for seen in found.values()):
         raise ValueError(f"device: no worker has the resource {GPU}: dask worker {address} --resources {GPU}=1")
+    return Guard(client, out, say, set(found))
 
 
 def _wait_for_one(client: Client, late: Callable[[], None]) -> None:
@@ -148,12 +150,14 @@ def _wait_for_one(client: Client, late: Callable[[], None]) -> None:
         raise ConnectionError("scheduler: it is gone") from error
 
 
+@dataclass
 class Guard:
-    """Knows the workers of ``client`` that have been looked at; others may join at any time."""
+    """The workers of ``client`` that are ``known`` to fit; others may join at any time."""
 
-    def __init__(self, client: Client, out: Path, say: Callable[[str], None]) -> None:
-        self.client, self.out, self.say = client, out, say
-        self.known = set(client.nthreads())
+    client: Client
+    out: Path
+    say: Callable[[str], None]
+    known: set[str]
 
     def __call__(self) -> None:
         """Send those away that have joined and do not fit: they would be done with everything in no time."""

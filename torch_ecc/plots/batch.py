@@ -50,7 +50,7 @@ def _draw(lines: list[list[Any]], texts: list[tuple[int, str, str, bool]], path:
     axes = figure.add_axes((0.0, 0.0, 1.0, 1 - 0.3 / figure.get_figheight()))
     axes.set(xlim=(0, columns), ylim=(rows, 0))
     axes.axis("off")
-    for own, colour in zip(lines, COLOURS, strict=True):
+    for own, colour in reversed(list(zip(lines, COLOURS, strict=True))):  # a theta that is only noise fills its cell
         placed = [np.add(curve, (n % columns, n // columns)) for n, curve in own]
         axes.add_collection(LineCollection(placed, colors=colour, linewidths=0.9))
     for number, title, words, failed in texts:
