@@ -34,7 +34,7 @@ class Linearised(NamedTuple):
             by = rows.mT @ by @ columns
         if by.shape == image.shape:
             return by
-        total, (h, w) = image.new_zeros(image.shape, dtype=by.dtype), by.shape[-2:]
+        total, (h, w) = by.new_zeros(image.shape), by.shape[-2:]
         corners = (self.sampler.origin + kernel.ring).long().tolist()
         for frame, (x, y), part in zip(cycle(total), corners, by, strict=False):
             frame[:, y : y + h, x : x + w] += part
@@ -43,7 +43,7 @@ class Linearised(NamedTuple):
     def by_values(self, by_g: Tensor) -> Tensor:
         """The gradient by the sampler's values (I, 1, h, w)."""
         values = self.sampler.values
-        total = torch.zeros_like(values)
+        total = by_g.new_zeros(values.shape)
         for at, weight in self.lookups:
             grid, by = at.mT.unsqueeze(1), (by_g * weight)[:, None, None]
             if len(values) == 1:  # of all templates together: not an image for each
