@@ -170,7 +170,7 @@ def test_what_was_not_found_takes_the_gradient_to_its_start(problem):
 
 
 def test_as_torch_asks_for_them():
-    """Twice, by a checkpoint, many at once, of a strided image; never of one that has changed since, nor derived twice."""
+    """Twice, by a checkpoint, many at once, of a strided image; not of one that changed since, nor derived twice."""
     templates, images, start = seen()
     reference, images = prepare(templates), images.requires_grad_()
 
