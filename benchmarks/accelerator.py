@@ -5,8 +5,8 @@ iterations over the measured rate of a copy is the roofline, of which the share 
 the one of an accelerator on any device, all iterations, no look of the host at a value: eager, as what torch.compile
 makes of it, and on a CUDA device replayed as a graph; there the fused engine too, which reads less and ends sooner than
 that, and on a CPU the native one, as it is used. First, what the gradient of poses costs. The cases come in the order
-of what they tell; when the ``--minutes`` are over those that are left are named; what was measured is written as it comes.
-Nothing has to be installed: beside torch it imports numpy, OpenCV, kornia, pydantic, click and rich.
+of what they tell; when the ``--minutes`` are over those that are left are named. All is written as it comes. Nothing
+has to be installed: beside torch it imports numpy, OpenCV, kornia, pydantic, click and rich.
 """
 
 from __future__ import annotations
