@@ -1,12 +1,12 @@
 """Thousands of templates on one device, beside its copy rate: python benchmarks/accelerator.py [--device cuda]
 
 Every iteration has to read of each pixel 4 rows of K and the frame's value, 20 bytes; so many times the pixels and the
-iterations over the measured rate of a copy is the roofline, of which the share reached is printed. The solve is the one
-of an accelerator on any device: all iterations, no look of the host at a value; the torch page eager, as what
-torch.compile makes of it, and on a CUDA device replayed as a graph; there the fused engine too, which reads less and
-ends sooner than that, and on a CPU the native one. Last, what the gradient of poses costs. The cases come in the order
-of what they tell; when the ``--minutes`` are over those that are left are named and what was measured is written.
-Beside torch it needs kornia, pydantic, click and rich.
+iterations over the measured rate of a copy is the roofline, of which the share reached is printed. The page's solve is
+the one of an accelerator on any device, all iterations, no look of the host at a value: eager, as what torch.compile
+makes of it, and on a CUDA device replayed as a graph; there the fused engine too, which reads less and ends sooner than
+that, and on a CPU the native one, as it is used. First, what the gradient of poses costs. The cases come in the order
+of what they tell; when the ``--minutes`` are over those that are left are named. All is written as it comes. Nothing
+has to be installed: beside torch it imports numpy, OpenCV, kornia, pydantic, click and rich.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Some
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -59,6 +59,11 @@ def seconds(device: torch.device, work: Callable[[], object], times: int) -> flo
         work()
     wait(device)
     return (time.perf_counter() - start) / times
+
+
+def card(device: torch.device) -> str:
+    """Its name."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
 def copy_rate(device: torch.device) -> float:
@@ -178,7 +183,7 @@ def measure(case: Case, frames: list[Tensor], place: torch.device, iterations: i
     near = reference.select(some).map(lambda tensor: tensor.cpu())
     page = replace(settings, backend="torch")
     exact = follow(lambda image, pose: solve(near, image, pose, page), [i.cpu() for i in images], start[some].cpu())
-    with never_looking():
+    with nullcontext() if case.way == "native" else never_looking():
         replay = made(lambda image, pose: solve(reference, image, pose, settings), images[0], start)
         found = follow(replay, images, start)
         taken = seconds(place, lambda: follow(replay, images, start), 3)
@@ -199,21 +204,22 @@ def told(case: Case, rate: float, speed: float, apart: float, least: int) -> lis
     ]
 
 
-def gradient_cost(frames: list[Tensor], place: torch.device) -> Number:
-    """The time of a backward pass over that of the solve without one: 16 templates of 61 px."""
+def gradient_cost(frames: list[Tensor], place: torch.device, count: int, size: int, backend: str) -> Number:
+    """The time of a backward pass over that of the solve without one: ``count`` templates of ``size`` px in a frame."""
     first, image, *_ = frames
-    tracker = Tracker(first, spread(16, 101, FRAME).round(), 61, device=place)
-    reference, start, settings = tracker.references[0], tracker.pose.clone(), Settings(robust=False)
+    tracker = Tracker(first, spread(count, size + 40, FRAME).round(), size, device=place)
+    reference, start, settings = tracker.references[0], tracker.pose.clone(), Settings(backend=backend)
     wanted = image.float().requires_grad_()
 
     def both() -> None:
         with torch.enable_grad():
             solve(reference, wanted, start, settings).pose.sum().backward()
 
-    alone = seconds(place, lambda: solve(reference, image, start, settings), 10)
-    share = seconds(place, both, 10) / alone - 1
-    console.print(f"the gradient of poses: {share:.2f} times the solve")
-    return Number("gradient of poses over the solve", share, "", "lower", 0.3)
+    alone = seconds(place, lambda: solve(reference, wanted, start, settings), 3)
+    share = seconds(place, both, 3) / alone - 1
+    name = f"gradient of poses over the solve, {count} of {size} px, {backend}"
+    console.print(f"{name}: {share:.2f} times {1e3 * alone:.3g} ms")
+    return Number(name, share, "", "lower", 0.3)
 
 
 def numbers(_: click.Context, __: click.Parameter, value: str | None) -> list[int] | None:
@@ -247,16 +253,18 @@ def main(
     ways = [*THERE.get(place.type, ["eager"]), *(["compiled"] if compiled else [])]
     shots = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).closed(), Camera())
     views, rate = [view[None].to(place) for view in shots], copy_rate(place)
-    console.print(f"{place}: copies {rate / 1e9:.1f} GB/s; {len(views) - 1} frames, {iterations} iterations")
+    console.print(f"{card(place)}: copies {rate / 1e9:.1f} GB/s; {len(views) - 1} frames, {iterations} iterations")
     figures, left = [Number("copy rate", rate / 1e9, "GB/s", "higher")], cases(counts, sizes, ways)
+    engines = dict.fromkeys(backend for backend, _ in (WAYS[way] for way in ways))
+    some = {counts[0], min(counts[-1], CHECKED)} if minutes > 0 else ()
+    figures += [gradient_cost(views, place, count, sizes[-1], backend) for backend in engines for count in some]
     while left and time.monotonic() < end:
         case = left.pop(0)
         figures += told(case, rate, *measure(case, views, place, iterations))
+        if out:
+            save(out, figures, device=card(place), iterations=str(iterations))
     for case in left:
         console.print(f"{case}: no time was left")
-    figures.append(gradient_cost(views, place))
-    if out:
-        save(out, figures, device=str(place), iterations=str(iterations))
 
 
 if __name__ == "__main__":

@@ -6,14 +6,13 @@ import json
 import math
 import os
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
-from torch_ecc.paper.result import Number, environment
+from torch_ecc.paper.result import Number, environment, version_of
 
 PEERS = ("opencv-python-headless", "pystackreg", "SimpleITK")
 
@@ -36,7 +35,7 @@ def show(title: str, header: tuple[str, ...], rows: list[tuple[str, ...]]) -> No
 def save(path: Path, figures: Iterable[Number], **about: str) -> None:
     """Write a result: four digits, null for a number that is not finite, and nothing that is the default."""
     load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
-    facts = environment() | _peers() | {"load": load} | about
+    facts = environment() | {name: version_of(name) for name in PEERS} | {"load": load} | about
     rows = [_row(figure) for figure in figures]
     lines = ",\n".join(f"    {json.dumps(row, allow_nan=False)}" for row in rows)
     path.write_text(f'{{\n  "about": {json.dumps(facts)},\n  "figures": [\n{lines}\n  ]\n}}\n', encoding="utf-8")
@@ -58,13 +57,3 @@ def _row(figure: Number) -> dict[str, Any]:
     value = float(f"{figure.value:.4g}") if math.isfinite(figure.value) else None
     default = Number._field_defaults
     return {k: v for k, v in figure._replace(value=value)._asdict().items() if k not in default or v != default[k]}
-
-
-def _peers() -> dict[str, str]:
-    found = {}
-    for name in PEERS:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found

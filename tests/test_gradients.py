@@ -7,6 +7,8 @@ import torch
 from engines import BACKENDS, CRITERIA, SAMPLERS, Problem
 from test_readme import BLOCKS
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.checkpoint import checkpoint
 
 import torch_ecc as te
 from torch_ecc.core import columns as prepared
@@ -165,6 +167,57 @@ def test_what_was_not_found_takes_the_gradient_to_its_start(problem):
     others = (estimate.score + estimate.residual_rms).sum() + estimate.covariance.nan_to_num(posinf=0).sum()
     for gradient in torch.autograd.grad(others, (image, templates)):
         assert gradient.isfinite().all()
+
+
+def test_as_torch_asks_for_them():
+    """Twice, by a checkpoint, many at once, of a strided image; not of one that changed since, nor derived twice."""
+    templates, images, start = seen()
+    reference, images = prepare(templates), images.requires_grad_()
+
+    def poses(images: Tensor) -> Tensor:
+        return te.align(reference, images, start).pose
+
+    (first,) = torch.autograd.grad(poses(images).sum(), images)
+    kept = checkpoint(poses, images, use_reentrant=False).sum()
+    for _ in range(2):
+        assert torch.equal(torch.autograd.grad(kept, images, retain_graph=True)[0], first)
+    strided = images.detach().permute(3, 1, 2, 0).contiguous().permute(3, 1, 2, 0).requires_grad_()
+    assert torch.equal(torch.autograd.grad(poses(strided).sum(), strided)[0], first)
+    one = poses(images)
+    (many,) = torch.autograd.grad(
+        one, images, torch.eye(9).double().view(9, 3, 3), is_grads_batched=True, retain_graph=True
+    )
+    torch.testing.assert_close(many.sum(0), first, rtol=1e-4, atol=1e-4 * float(first.abs().max()))
+    (gradient,) = torch.autograd.grad(one.sum(), images, create_graph=True)
+    with pytest.raises(RuntimeError, match="grad"):
+        torch.autograd.grad(gradient.sum(), images)
+    moved = 1 * images
+    pose = poses(moved)
+    moved.mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        pose.sum().backward()
+
+
+def test_nobody_pays_for_what_is_not_asked():
+    """While poses are found no patch is sampled for the sake of gradients; and then each once, and back."""
+    templates, images, start = seen()
+    calls: list[str] = []
+
+    class Listening(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            calls.append(func.__name__)
+            return func(*args, **(kwargs or {}))
+
+    counts = []
+    for image in (images, images.clone().requires_grad_()):
+        with Listening():
+            pose = te.align(prepare(templates), image, start, backend="torch").pose
+        counts.append(sum("grid_sampler" in name for name in calls))
+        calls.clear()
+    assert counts[0] == counts[1] > 0
+    with Listening():
+        pose.sum().backward()
+    assert sum("grid_sampler" in name for name in calls) == 12  # of four pairs of taps: value, slopes, transpose
 
 
 def test_a_start_has_no_share_in_what_was_found():

@@ -164,3 +164,13 @@ def test_blur_is_a_gaussian_mirrored_at_the_border(sigma, shape):
 def test_colours_become_grey_as_another_library_has_it():
     image = 255 * torch.rand(2, 3, 20, 30, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(as_gray("test", "image", image), kornia.color.rgb_to_grayscale(image), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("interpolation", S.SAMPLERS)
+def test_slopes_of_taps(interpolation):
+    """Those of the weights are what autograd makes of them."""
+    kernel, f = S.SAMPLERS[interpolation], torch.linspace(0.01, 0.99, 20, dtype=torch.float64).requires_grad_()
+    for (_, *weights), slopes in zip(kernel.pairs(f), kernel.slopes(f.detach()), strict=True):
+        for weight, slope in zip(weights, slopes, strict=True):
+            true = torch.autograd.grad(weight.sum() + 0 * f.sum(), f, retain_graph=True)[0]
+            torch.testing.assert_close(slope, true)

@@ -22,13 +22,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch.autograd.function import FunctionCtx, once_differentiable
 
 from torch_ecc.core.criteria import ECC, safe_inverse
+from torch_ecc.core.linearised import linearised
 from torch_ecc.core.normal import Normal
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference, each, reweigh
@@ -101,6 +102,11 @@ class Place(NamedTuple):
         return (reference.criterion.step(reference, g),)
 
 
+class _Context(FunctionCtx):
+    place: Place
+    saved_tensors: tuple[Tensor, ...]
+
+
 class _Answer(torch.autograd.Function):
     """Pose, gain and sums of templates found in an ``image`` at a ``Place``, and their normal equations if these have
     gradients too."""
@@ -112,14 +118,16 @@ class _Answer(torch.autograd.Function):
         return tuple(number.clone() for number in numbers[: len(template)])  # as many of the normal equations
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    def setup_context(
+        ctx: _Context, inputs: tuple[Place, Tensor, Tensor, *tuple[Tensor, ...]], output: tuple[Tensor, ...]
+    ) -> None:
         ctx.place, image, _, *template = inputs
         ctx.save_for_backward(image, *template[: len(Template._fields)])
         ctx.set_materialize_grads(False)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_pose: Tensor | None, *by_sums: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: _Context, by_pose: Tensor | None, *by_sums: Tensor | None) -> tuple[Tensor | None, ...]:
         image, *template = ctx.saved_tensors
         by_image, by_template = gradients(ctx.place, image, template, by_pose, by_sums)
         return None, by_image, torch.zeros_like(ctx.place.found.pose), *by_template
@@ -141,8 +149,8 @@ def gradients(
     pose, (by_sums, by_normal) = place.found.pose, (by_sums[:3], by_sums[3:])
     warp = reference.warps(pose)
     sample = make_sampler(place.interpolation, image.to(reference.K.dtype), warp, reference.grid.box)
-    g, slopes, by_values = sample.linearised(warp, pixels)
-    slopes = along_pose(slopes, warp, pose, pixels)
+    seen = linearised(sample, warp, pixels)
+    g, slopes = seen.g, along_pose(seen.slopes, warp, pose, pixels)
     U = slope_of_step(reference, g)
     inverse, solved = inverse_slope(U, slopes, turn(pose[:, 2]))
     by_g, *by_look = pulled(place.sums, (g.requires_grad_(), *template), by_sums)
@@ -154,7 +162,7 @@ def gradients(
     by_template = [added(solved, *both) for both in (*zip(by_look, by_step, strict=True), *((v,) for v in by_normal))]
     if not image.requires_grad:
         return None, by_template
-    return sample.by_image(by_values(only(solved, by_g, torch.zeros_like(g))), image), by_template
+    return seen.by_image(only(solved, by_g, torch.zeros_like(g)), image), by_template
 
 
 def pulled(function: Callable[..., Sequence[Tensor]], at: Sequence[Tensor], by: Gradients) -> list[Tensor | None]:

@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import chain
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -178,15 +178,13 @@ class Reference(_Groups):
     def distorted(self, distortion: Tensor | None) -> Reference:
         """The same templates, seen with another ``distortion`` (B, 2, 2)."""
         coarse = None if self.coarse is None else self.coarse.distorted(distortion)
-        return self._like(coarse=coarse, distortion=distortion)
+        other = self._replace(coarse=coarse, distortion=distortion)
+        other.__dict__ = self.__dict__  # what is made once depends on no distortion
+        return other
 
     def judged_by(self, normal: Normal) -> Reference:
-        """The same templates with ``normal`` equations of the same numbers, but with other gradients."""
-        return self._like(normal=normal)
-
-    def _like(self, **changed: Any) -> Reference:
-        """The same but for what nothing depends on that is made once."""
-        other = self._replace(**changed)
+        """The same templates with ``normal`` equations that have the same numbers, and gradients."""
+        other = self._replace(normal=normal)
         other.__dict__ = self.__dict__
         return other
 

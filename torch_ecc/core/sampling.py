@@ -24,6 +24,7 @@ ROUNDING = 1e-6  # px: a pixel on the frame's outermost row is in sight, however
 FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65535.0)  # grey levels at which cameras clip
 
 Pairs = list[tuple[int, Tensor, Tensor]]  # of taps: the first one's offset, the sum of both weights, the second weight
+Slopes = list[tuple[Tensor, Tensor]]  # of these two by f
 
 
 def _linear(f: Tensor) -> Pairs:
@@ -51,16 +52,39 @@ def _quintic(f: Tensor) -> Pairs:
     return [(k - 2, w[k] + w[k + 1], w[k + 1]) for k in (0, 2, 4)]
 
 
+def _linear_slopes(f: Tensor) -> Slopes:
+    return [(torch.zeros_like(f), torch.ones_like(f))]
+
+
+def _cubic_slopes(f: Tensor) -> Slopes:
+    r, square = 1 - f, f * f
+    high = f - square + 0.5
+    return [(-high, torch.addcmul(-high, r, r, value=0.5)), (high, square / 2)]
+
+
+def _quintic_slopes(f: Tensor) -> Slopes:
+    r = 1 - f
+    w = [
+        *(-(r**4) / 24, (6 * r**4 - (1 + r) ** 4) / 24),
+        (6 * (1 + r) ** 4 - (2 + r) ** 4 - 15 * r**4) / 24,
+        ((2 + f) ** 4 - 6 * (1 + f) ** 4 + 15 * f**4) / 24,
+        *(((1 + f) ** 4 - 6 * f**4) / 24, f**4 / 24),
+    ]
+    return [(w[k] + w[k + 1], w[k + 1]) for k in (0, 2, 4)]
+
+
 class Kernel(NamedTuple):
     """An interpolation: how neighbouring pixels make a value between them. To add one, add it to ``SAMPLERS``.
 
-    ``pairs``: of its non-negative taps around a point with fractional part f, any shape; ``taps``: the kernel at 0, 1,
-    2 ... px, if it is not the identity there and images are prefiltered; ``radius``: px beyond which pixels bear on a
-    value by less than 2e-4 of their contrast; ``noise_gain``: variance of white noise after sampling, mean over all
-    sub-pixel phases (a sampler smooths what lies between pixels); ``aliases``: whether its own error counts.
+    ``pairs``: of its non-negative taps around a point with fractional part f, any shape; ``slopes``: by how much they
+    change with f; ``taps``: the kernel at 0, 1, 2 ... px, if it is not the identity there and images are prefiltered;
+    ``radius``: px beyond which pixels bear on a value by less than 2e-4 of their contrast; ``noise_gain``: variance of
+    white noise after sampling, mean over all sub-pixel phases (a sampler smooths what lies between pixels);
+    ``aliases``: whether its own error counts.
     """
 
     pairs: Callable[[Tensor], Pairs]
+    slopes: Callable[[Tensor], Slopes]
     taps: tuple[float, ...] = (1.0,)
     radius: int = 1
     noise_gain: float = 1.0
@@ -73,9 +97,11 @@ class Kernel(NamedTuple):
 
 
 SAMPLERS = {
-    "bilinear": Kernel(_linear, noise_gain=4 / 9),
-    "bspline3": Kernel(_cubic, (4 / 6, 1 / 6), 7, 0.7643),  # 0.27^7 and 0.43^10: the inverse filters' decay
-    "bspline5": Kernel(_quintic, (66 / 120, 26 / 120, 1 / 120), 10, 0.8427, aliases=False),
+    "bilinear": Kernel(_linear, _linear_slopes, noise_gain=4 / 9),
+    "bspline3": Kernel(
+        _cubic, _cubic_slopes, (4 / 6, 1 / 6), 7, 0.7643
+    ),  # 0.27^7 and 0.43^10: the inverse filters' decay
+    "bspline5": Kernel(_quintic, _quintic_slopes, (66 / 120, 26 / 120, 1 / 120), 10, 0.8427, aliases=False),
 }
 SLOPE = (0.0, 1 / 2)  # of the cubic B-spline at 0 and 1 px, but for the sign
 
@@ -103,65 +129,43 @@ class Sampler(NamedTuple):
 
     def __call__(self, warp: Tensor, pixels: Tensor) -> Tensor:
         """Values at ``warp`` (B, 2, 3) of ``pixels`` (3, N): (B, N). Outside, its border repeats."""
-        return self._at(self._points(warp, pixels))
+        return self._at(self.points(warp, pixels))
 
-    def linearised(self, warp: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-        """These values (B, N), their d/dx and d/dy (B, 2, N) per px of the frame, and what takes a gradient by them to
-        that by ``self.values``. Where they have a kink, as bilinear ones have on the pixels, slopes are those to the
-        right and down."""
-        with torch.enable_grad():
-            values, points = (v.detach().requires_grad_() for v in (self.values, self._points(warp, pixels)))
-            g = self._replace(values=values)._at(points)
-        (slopes,) = torch.autograd.grad(g, points, torch.ones_like(g), retain_graph=True)
-        slopes = slopes if self.kernel.ring else slopes * self._scale().to(slopes.dtype)
-        return g.detach(), slopes, lambda by_value: torch.autograd.grad(g, values, by_value)[0]
-
-    def by_image(self, by_values: Tensor, image: Tensor) -> Tensor:
-        """The gradient by the ``image`` (I, 1, H, W) that it was made of, from that by its ``values``: the transpose of
-        ``make_sampler``."""
-        ring = self.kernel.ring
-        if ring:
-            given = self.kernel.taps, ring, by_values.dtype, by_values.device
-            rows, columns = (_prefilter_matrix(n - 2 * ring, *given) for n in by_values.shape[-2:])
-            by_values = rows.mT @ by_values @ columns
-        if by_values.shape == image.shape:
-            return by_values
-        total, (h, w) = image.new_zeros(image.shape, dtype=by_values.dtype), by_values.shape[-2:]
-        corners = (self.origin + ring).long().tolist()
-        for frame, (x, y), part in zip(cycle(total), corners, by_values, strict=False):
-            frame[:, y : y + h, x : x + w] += part
-        return total
-
-    def _scale(self) -> Tensor:
+    def scale(self) -> Tensor:
+        """What takes px from value (0, 0) to grid_sample's coordinates plus 1: (2, 1)."""
         h, w = self.values.shape[-2:]
         return _to_unit(h, w, self.values.device)
 
-    def _points(self, warp: Tensor, pixels: Tensor) -> Tensor:
+    def points(self, warp: Tensor, pixels: Tensor) -> Tensor:
         """Where (B, 2, N) the ``warp`` takes ``pixels``: px from value (0, 0); without prefilter, where no more is done
         with them, in grid_sample's coordinates at once."""
         turn, shift = warp[:, :, :2], warp[:, :, 2:] - self.origin[:, :, None]
         if self.kernel.ring == 0:
-            scale = self._scale()
+            scale = self.scale()
             turn, shift = turn * scale, shift * scale - 1
         warp = torch.cat((turn, shift), 2).to(pixels.dtype)
         return torch.mm(warp.view(-1, 3), pixels).view(len(warp), 2, -1)
 
     def _at(self, points: Tensor) -> Tensor:
-        """Values (B, N) at ``_points`` (B, 2, N).
+        """Values (B, N) at ``points`` (B, 2, N).
 
         Taps are non-negative, so each pair of neighbouring ones is one bilinear lookup at their centre of mass
         (Ruijters et al., 2008): a quarter as many lookups as there are taps.
         """
         if self.kernel.ring == 0:
-            return _lookup(self.values, points)
-        floor, scale = points.floor(), self._scale().to(points.dtype)
+            return lookup(self.values, points)
+        floor = points.floor()
         pairs = self.kernel.pairs(points - floor)
-        n = len(pairs)
+        wx, wy = zip(*(total.unbind(1) for _, total, _ in pairs), strict=True)
+        return _sum([_sum([lookup(self.values, at) for at in row], wx) for row in self.middles(floor, pairs)], wy)
+
+    def middles(self, floor: Tensor, pairs: Pairs) -> list[list[Tensor]]:
+        """Where (B, 2, N) to look up each pair of rows, and in it each pair of columns, of points behind the pixels
+        ``floor`` (B, 2, N): in grid_sample's coordinates."""
+        n, scale = len(pairs), self.scale().to(floor.dtype)
         middles = [torch.addcdiv(floor, second, total).add_(first).mul_(scale) for first, total, second in pairs]
         at = torch.stack(middles, 2).sub_(1).flatten(1, 2)  # x of each pair of columns, then y of each pair of rows
-        wx, wy = zip(*(total.unbind(1) for _, total, _ in pairs), strict=True)
-        rows = [[_lookup(self.values, at[:, i : n + j + 1 : n + j - i]) for i in range(n)] for j in range(n)]
-        return _sum([_sum(row, wx) for row in rows], wy)
+        return [[at[:, i : n + j + 1 : n + j - i] for i in range(n)] for j in range(n)]
 
     def select(self, index: Tensor) -> Sampler:
         """The sampler of some of the templates."""
@@ -236,11 +240,10 @@ def _to_unit(h: int, w: int, device: torch.device) -> Tensor:
     return torch.cat([torch.full((1, 1), end, dtype=pose_dtype(device), device=device) for end in ends])
 
 
-def _lookup(image: Tensor, points: Tensor) -> Tensor:
+def lookup(image: Tensor, points: Tensor) -> Tensor:
     """Bilinear lookup of ``image`` (I, 1, H, W) at normalised points (B, 2, N): (B, N). Its border repeats."""
-    grid, alone = points.mT.unsqueeze(1), len(image) == 1 and image.requires_grad  # else its gradient is B images
-    grid = grid.transpose(0, 1) if alone else grid
-    image = image if len(image) == len(grid) else image.expand(len(grid), -1, -1, -1)
+    image = image if len(image) == len(points) else image.expand(len(points), -1, -1, -1)
+    grid = points.mT.unsqueeze(1)
     values = F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)
     return values.view(len(points), -1)
 
@@ -272,7 +275,7 @@ def prefilter(image: Tensor, interpolation: str, ring: int = 0) -> Tensor:
         compiled: Tensor = torch.ops.torch_ecc.prefilter(image, interpolation, ring)
         return compiled
     taps, like = SAMPLERS[interpolation].taps, (image.dtype, image.device)
-    rows, columns = (_prefilter_matrix(n, taps, ring, *like) for n in image.shape[-2:])
+    rows, columns = (prefilter_matrix(n, taps, ring, *like) for n in image.shape[-2:])
     return rows @ image @ columns.mT
 
 
@@ -289,7 +292,8 @@ torch.library.register_fake("torch_ecc::prefilter", _prefilter_shape, lib=_opera
 
 
 @constant
-def _prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def prefilter_matrix(n: int, taps: tuple[float, ...], ring: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """What ``prefilter`` does to columns of n values: (n + 2 ring, n)."""
     inverse = torch.linalg.inv(_band(n, taps, 1, torch.device("cpu")))
     extended: Tensor = inverse[_mirror(torch.arange(-ring, n + ring, device="cpu"), n)]
     return extended.to(device, dtype)
@@ -331,7 +335,7 @@ def _quarter(n: int, interpolation: str) -> Tensor:
     for first, total, second in kernel.pairs(torch.tensor(0.25, dtype=torch.float32, device=cpu)):
         taps[index, _mirror(index + first, n)] += total - second
         taps[index, _mirror(index + first + 1, n)] += second
-    return taps @ _prefilter_matrix(n, kernel.taps, 0, torch.float32, cpu) if kernel.ring else taps
+    return taps @ prefilter_matrix(n, kernel.taps, 0, torch.float32, cpu) if kernel.ring else taps
 
 
 def pad(image: Tensor, margin: int) -> Tensor:

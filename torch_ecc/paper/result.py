@@ -7,14 +7,16 @@ import math
 import os
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
+
+if TYPE_CHECKING:  # benchmarks on a bare machine draw nothing
+    from matplotlib.figure import Figure
 
 Advance = Callable[[int, int], None]  # (done, total)
 
@@ -84,12 +86,20 @@ def cells(values: Iterable[float] | Tensor, form: str, sigma: Tensor | None = No
 
 def environment() -> dict[str, str]:
     """Versions, threads and machine that numbers depend on."""
-    versions = {name: version(name) for name in ("torch_ecc", "torch", "kornia", "matplotlib")}
+    versions = {name: version_of(name) for name in ("torch_ecc", "torch", "kornia", "matplotlib")}
     return versions | {
         "python": platform.python_version(),
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
         "threads": str(torch.get_num_threads()),
     }
+
+
+def version_of(name: str) -> str:
+    """That of a package, if it is installed."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
 
 
 def _processor() -> str:
