@@ -44,7 +44,7 @@ def write_track(folder, micrometres: bool = True, fps: float | None = 100.0, los
             flat = torch.ones(2)
             covariance = 1e-6 * torch.eye(3).double().expand(2, 3, 3)
             fields = {"pose": moved + 300.0, "displacement": moved, "status": status, "covariance": covariance}
-            fields["reason"] = 0 * status
+            fields["reason"] = fields["origin"] = 0 * status
             writer.write(Estimate(**{name: fields.get(name, flat) for name in Estimate._fields}))
     return str(folder / "track.csv")
 

@@ -23,7 +23,8 @@ from torch_ecc.io.table import Table
 
 NAMES = {0: "CONVERGED", 1: "MAX_ITERATIONS", 2: "LOST", 3: "OUT_OF_VIEW"}
 REASONS = {0: "", 1: "MOVING", 2: "COVERED", 3: "OUT_OF_VIEW"}
-WORDS = {"status_names": NAMES, "reason_names": REASONS}
+ORIGINS = {0: "TRACKED", 1: "NEARBY"}
+WORDS = {"status_names": NAMES, "reason_names": REASONS, "origin_names": ORIGINS}
 FINAL = {"track.csv", "track.npz", "summary.json"}
 
 
@@ -37,6 +38,7 @@ class Report(NamedTuple):
     residual_rms: Tensor
     coverage: Tensor
     reason: Tensor
+    origin: Tensor
 
 
 def report(seed: int = 0, templates: int = 2, *, lost: tuple[int, ...] = ()) -> Report:
@@ -59,6 +61,7 @@ def report(seed: int = 0, templates: int = 2, *, lost: tuple[int, ...] = ()) -> 
         3 * score,
         score,
         status,
+        (score > 0.5).to(torch.int8),
     )
 
 
@@ -114,9 +117,10 @@ def check_rows(table: list[dict[str, str]], track: dict[str, np.ndarray], fps: f
     assert [(int(row["frame"]), int(row["template"])) for row in table] == list(np.ndindex(frames, templates))
     for row in table:
         at = int(row["frame"]), int(row["template"])
-        words = ("status", "reason", "damage")
+        words = ("status", "reason", "origin", "damage")
         found = {name: float(value or "nan") for name, value in row.items() if name not in words}
         assert row["reason"] == REASONS[track["reason"][at]]
+        assert row["origin"] == (ORIGINS[track["origin"][at]] if track["status"][at] < 2 else "")
         pose = [found[name] for name in ("x_px", "y_px", "theta_rad")]
         moved = [found[name] for name in ("dx_px", "dy_px", "dtheta_rad")]
         sigma = [found[name] for name in ("sigma_x_px", "sigma_y_px", "sigma_theta_rad")]
@@ -141,7 +145,7 @@ def test_columns_carry_their_units(tmp_path):
         writer.write(report())
     assert (tmp_path / "track.csv").read_text().splitlines()[0] == (
         "frame,template,time_s,x_px,y_px,theta_rad,dx_px,dy_px,dtheta_rad,dx_um,dy_um,"
-        "sigma_x_px,sigma_y_px,sigma_theta_rad,score,status,reason,iterations,residual_rms,coverage,damage"
+        "sigma_x_px,sigma_y_px,sigma_theta_rad,score,status,reason,origin,iterations,residual_rms,coverage,damage"
     )
 
 
@@ -155,6 +159,10 @@ def test_summary(tmp_path):
     assert (found["complete"], found["reason"], found["frames"], found["templates"]) == (True, None, 10, 2)
     first, second = found["per_template"]
     assert first["status"] == {"CONVERGED": 9, "LOST": 1}
+    assert sum(first["origins"].values()) == 9  # of what was lost none
+    assert found["origins"] == {
+        word: sum(one["origins"].get(word, 0) for one in (first, second)) for word in found["origins"]
+    }
     assert (first["lost_frames"], first["first_lost_frame"], first["last_lost_frame"]) == (1, 3, 3)
     assert (second["lost_frames"], second["first_lost_frame"], second["last_lost_frame"]) == (6, 4, 9)
     track = np.load(tmp_path / "track.npz")

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 from torch import Tensor
 
-from torch_ecc.commands.track import REASON_NAMES, STATUS_NAMES
+from torch_ecc.commands.track import ORIGIN_NAMES, REASON_NAMES, STATUS_NAMES
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.io import OverlayWriter, TrackWriter
 from torch_ecc.plots import plot_track
@@ -97,7 +97,8 @@ def _open(stack: ExitStack, folder: Path, tracker: Tracker) -> tuple[TrackWriter
     um = Calibration(UM_PER_PX).matrix(torch.zeros(1, dtype=torch.float64))[:2, :2]
     settings = {"criterion": str(tracker.criterion), "size": SIZE, "um_per_px": UM_PER_PX, **asdict(tracker.settings)}
     words: dict[str, Any] = {"status_names": STATUS_NAMES, "fps": 25.0, "um_matrix": um}
-    track = TrackWriter(folder, reason_names=REASON_NAMES, settings=settings, **words)
+    names: dict[str, Any] = {"reason_names": REASON_NAMES, "origin_names": ORIGIN_NAMES}
+    track = TrackWriter(folder, settings=settings, **names, **words)
     overlay = OverlayWriter(folder, shapes=[(SIZE, SIZE)], **words)
     return stack.enter_context(track), stack.enter_context(overlay)
 

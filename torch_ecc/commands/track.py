@@ -22,7 +22,7 @@ from torch_ecc.commands.live import Latency, Send, as_it_comes, sender
 from torch_ecc.commands.run import Pictures, Run
 from torch_ecc.commands.templates import Templates, choose_templates, read_frame_mask, read_templates, refuse_doubt
 from torch_ecc.core.ambient import threads_for
-from torch_ecc.core.estimate import Estimate, Reason, Status
+from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.io import Frame, OverlayWriter, TrackWriter, open_frames
 from torch_ecc.io.beside import ahead
 from torch_ecc.io.journal import Unfinished
@@ -35,6 +35,7 @@ from torch_ecc.track.tracker import Tracker
 
 STATUS_NAMES = {int(code): code.name for code in Status}
 REASON_NAMES = {int(code): code.word for code in Reason}
+ORIGIN_NAMES = {int(code): code.name for code in Origin}
 RESULTS = (*FILES, *BODY_FILES, "track.png", "overlay.mp4", "overlay", "stabilised.mp4")
 MANY = 8  # templates that were lost: of more there is one line
 NOT_OF_THE_RESULT = ("out", "force", "resume", "send")
@@ -233,6 +234,7 @@ class Session:
             self.folder,
             status_names=STATUS_NAMES,
             reason_names=REASON_NAMES,
+            origin_names=ORIGIN_NAMES,
             fps=self.source.fps,
             um_matrix=self._um_matrix(),
             settings=self.settings,

@@ -47,7 +47,7 @@ class Origin(IntEnum):
 class Reason(IntEnum):
     """Why a pose is not to be trusted: NONE if, and only if, the status is CONVERGED. Every other one goes with one
     status: MOVING with MAX_ITERATIONS, UNSURE and NOISE with LOW_TEXTURE, those from COVERED to AMBIGUOUS and from
-    TOO_FAR on with LOST."""
+    TOO_FAR on with LOST; but BLURRED with LOST or, where sigma is too large, LOW_TEXTURE."""
 
     NONE = 0
     MOVING = 1
@@ -64,6 +64,9 @@ class Reason(IntEnum):
     TOO_FAR = 12
     SHARED = 13
     WAITING = 14
+    DARK = 15
+    CLIPPED = 16
+    BLURRED = 17
 
     @property
     def word(self) -> str:
@@ -90,7 +93,7 @@ _REASONS = {
     Reason.COVERED: "Less than half of the template is believed: something covers it, or it is not there.",
     Reason.UNLIKE: "The frame does not look like the template where it was looked for: it is covered, or gone.",
     Reason.INVERTED: "The frame looks like the template's negative.",
-    Reason.FLAT: "Next to no contrast is there: too dark, too bright, far out of focus, or covered whole.",
+    Reason.FLAT: "Next to no contrast is there: far out of focus, or covered whole.",
     Reason.ELSEWHERE: "It slid to another place, where the frame looks less like the template than usual.",
     Reason.AMBIGUOUS: "The best place found may be that of something else that looks like the template.",
     Reason.OUT_OF_VIEW: "Too little of the template lies inside the frame.",
@@ -100,6 +103,9 @@ _REASONS = {
     Reason.TOO_FAR: "It was found farther from its last place than the largest step that was stated.",
     Reason.SHARED: "Another template of the tracker has come to the same place, and looks the same.",
     Reason.WAITING: "It is lost, and its turn to be searched for has not come yet.",
+    Reason.DARK: "The frame is dark where it was last: light is missing.",
+    Reason.CLIPPED: "The frame is clipped where it was last: there is too much light.",
+    Reason.BLURRED: "Coarsely the frame looks like the template, but what is fine is gone: it is out of focus.",
 }
 
 

@@ -34,6 +34,8 @@ LEAST_SHARE = 0.2  # of the information, if it is white: with less, noise of no 
 DOUBTFUL_SHARE = 0.8  # of the noise that there may be, as the likely reason why a template was not found
 LEAST_CONTRAST = 0.1  # of the template's: what has less is flat, and so is what has no more than
 BARE_NOISE = 2.0  # times the template's noise
+ALIKE = 0.7  # correlation of what is coarse from which it is the template
+FINE = 0.5  # of the template's share of what is finer: less is left of it where it is blurred
 PLANAR = 1e-5  # of a patch's power: what is left of it off the plane of light is rounding
 
 Number = TypeVar("Number", float, Tensor)
@@ -174,6 +176,8 @@ def explained(
     status, reason = (_codes(k, failed.device).index_select(0, failed) for k in (0, 1))
     lost = status == Status.LOST
     reason = torch.where(lost & (match < -min_score), int(Reason.INVERTED), reason)
+    soft = (lost | (reason == Reason.UNSURE)) & blurred(reference, found)
+    reason = torch.where(soft, int(Reason.BLURRED), reason)
     reason = torch.where(lost & without_contrast(reference, found), int(Reason.FLAT), reason)
     textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
     low = textureless & (lost | (status == Status.OUT_OF_VIEW))
@@ -187,6 +191,24 @@ def without_contrast(reference: Reference, found: Solution) -> Tensor:
     most = torch.maximum(LEAST_CONTRAST**2 * normal.energy, BARE_NOISE * reference.noise.of_frame * normal.total)
     flat: Tensor = found.total[:, 2] <= most
     return flat
+
+
+def blurred(reference: Reference, found: Solution) -> Tensor:
+    """Where (B,) blocks look like the template's but for what is finer than they are."""
+    blocks, (count, g, square), noise = reference.blocks, found.sums[:, :3].unbind(1), reference.noise.of_frame
+    shares = []
+    for n, one, two in ((count, g, square), (blocks.weight, blocks.t, blocks.square)):
+        inside, power = (two - one * one / n.clamp(min=LEAST)).sum(1), (noise * n.sum(1)).to(n)
+        shares.append((inside - power).clamp(min=0) / (two.sum(1) - power).clamp(min=LEAST))
+    return (coarse_correlation(reference, found.sums) >= ALIKE) & (shares[0] <= FINE * shares[1])
+
+
+def coarse_correlation(reference: Reference, sums: Tensor, trust: Tensor | None = None) -> Tensor:
+    """That (B,) of the means of blocks with ``sums`` (B, 10, blocks) with the template's."""
+    weight = sums[:, 0] if trust is None else sums[:, 0] * trust
+    g, t = sums[:, 1] / sums[:, 0].clamp(min=LEAST), reference.blocks.t / reference.blocks.weight.clamp(min=LEAST)
+    (g, norm), (t, contrast) = centred(g, weight), centred(t, weight)
+    return (g * t * weight).sum(1) / (norm * contrast).clamp(min=LEAST)
 
 
 def _limits(settings: Settings) -> list[tuple[int, float]]:
@@ -260,11 +282,7 @@ def detrended(normal: Normal, total: Tensor) -> Tensor:
 def without_noise(reference: Reference, found: Solution, score: Tensor) -> Tensor:
     """What the ``score`` (B,) would be without noise that hides a dim template: over what the template's noise lets
     expect, and no more than the correlation of the blocks' means, in which noise is next to nothing."""
-    sums = found.sums if found.trust is None else found.sums * found.trust[:, None]
-    weight, some = sums[:, 0], reference.blocks.weight.clamp(min=LEAST)
-    g, t = sums[:, 1] / found.sums[:, 0].clamp(min=LEAST), reference.blocks.t / some
-    (g, norm), (t, contrast) = centred(g, weight), centred(t, weight)
-    coarse = (g * t * weight).sum(1) / (norm * contrast).clamp(min=LEAST)
+    coarse = coarse_correlation(reference, found.sums, found.trust)
     return torch.minimum(score / expected_score(reference).clamp(min=LEAST), coarse)
 
 

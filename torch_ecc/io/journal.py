@@ -140,7 +140,7 @@ class Journal:
     def append(
         self, arrays: Mapping[str, NDArray[Any]], said: tuple[list[str], ...], frame: Frame, state: bytes
     ) -> None:
-        """One frame more, with its words for status and reason ``said``. ValueError if it is not like the first one."""
+        """One frame more, with what is ``said`` of it in words. ValueError if it is not like the first one."""
         row = np.zeros((), self._dtype)
         for name in set(self.fields) - {"frame", "time_s"}:
             if arrays[name].shape != row[name].shape:

@@ -16,6 +16,8 @@ StatusNames: TypeAlias = Mapping[int, str]
 """The word for each status code, for example ``{0: "CONVERGED", 1: "MAX_ITERATIONS", 2: "LOST"}``."""
 ReasonNames: TypeAlias = Mapping[int, str]
 """The word for each reason code, empty where a pose can be trusted, for example ``{0: "", 1: "COVERED"}``."""
+OriginNames: TypeAlias = Mapping[int, str]
+"""The word for how a pose was come by, for example ``{0: "TRACKED", 1: "NEARBY"}``."""
 
 CONVERGED: Final = "CONVERGED"
 DOUBTFUL: Final = "MAX_ITERATIONS"
@@ -46,6 +48,8 @@ class Record(Protocol):
     def coverage(self) -> Tensor: ...  # (R,)
     @property
     def reason(self) -> Tensor: ...  # (R,) integer
+    @property
+    def origin(self) -> Tensor: ...  # (R,) integer
 
 
 FIELDS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
@@ -58,6 +62,7 @@ FIELDS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
     "residual_rms": ("f8", ()),
     "coverage": ("f8", ()),
     "reason": ("i1", ()),
+    "origin": ("i1", ()),
 }
 """dtype and shape of each field per template."""
 

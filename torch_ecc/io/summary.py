@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import platform
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -14,31 +15,33 @@ import torch
 from numpy.typing import NDArray
 
 from torch_ecc.io.output import append, create
-from torch_ecc.io.records import CONVERGED, DAMAGED, DOUBTFUL, ReasonNames, StatusNames
+from torch_ecc.io.records import CONVERGED, DAMAGED, DOUBTFUL
 
-_CODES = 128  # that an int8 has for a status or a reason
+_CODES = 128  # that an int8 has for a status, a reason or an origin
 _VALUES = 1 << 17  # of all templates: medians over more are taken of frames some apart
 _NEVER = -1
 
 
 class Tally:
     """What the records of ``frames`` frames of R ``templates`` come to; they are added some at a time, and memory does
-    not grow with their number. ``names`` and ``reasons`` are the words of their codes."""
+    not grow with their number. ``names``: the words of their codes of status, reason and origin."""
 
-    def __init__(self, templates: int, frames: int, names: StatusNames, reasons: ReasonNames) -> None:
-        self._names, self._reasons, self._frames = names, reasons, 0
+    def __init__(self, templates: int, frames: int, names: Mapping[str, Mapping[int, str]]) -> None:
+        self._names, self._frames = names, 0
         self._apart = max(frames * templates // _VALUES, 1)  # in frames, of those that the medians are of
         self._variances: list[NDArray[np.float64]] = []
-        self._codes = {field: np.zeros((templates, _CODES), np.int64) for field in ("status", "reason")}
+        self._codes = {field: np.zeros((templates, _CODES), np.int64) for field in names}
         self._first, self._last = np.full((2, templates), _NEVER)
         self._score, self._coverage, self._found = np.zeros((3, templates))
         self._least, self._drift = np.full(templates, math.inf), np.full((templates, 3), math.nan)
 
     def add(self, records: NDArray[Any]) -> None:
         """(F,) of them more, as they follow those before."""
-        found = np.isin(records["status"], [k for k, word in self._names.items() if word in (CONVERGED, DOUBTFUL)])
+        found = np.isin(records["status"], self._saying(CONVERGED, DOUBTFUL))
         for field, counts in self._codes.items():
-            counts += [np.bincount(codes, minlength=_CODES) for codes in records[field].T]
+            counted = found if field == "origin" else np.ones_like(found)  # what is lost was come by in no way
+            each = zip(records[field].T, counted.T, strict=True)
+            counts += [np.bincount(codes[there], minlength=_CODES) for codes, there in each]
         self._score += records["score"].sum(0)
         self._coverage += np.where(found, records["coverage"], 0.0).sum(0)
         self._least = np.minimum(self._least, np.where(found, records["coverage"], math.inf).min(0))
@@ -54,16 +57,17 @@ class Tally:
 
     def summary(self, error: BaseException | None) -> dict[str, object]:
         """Of all that was added; ``error`` is what ended the run before its time, if anything did."""
-        status, reason = self._codes["status"], self._codes["reason"]
+        status = self._codes["status"]
         median = np.sqrt(np.median(np.concatenate(self._variances), 0))
         return {
             "complete": error is None,
             "reason": _describe(error),
             "frames": self._frames,
-            "damaged_frames": sum(int(status[0, code]) for code, word in self._names.items() if word == DAMAGED),
+            "damaged_frames": int(status[0, self._saying(DAMAGED)].sum()),
             "templates": len(status),
             "rows": self._frames * len(status),
-            "reasons": _counted(reason.sum(0), self._reasons),
+            "reasons": self._counted("reason"),
+            "origins": self._counted("origin"),
             "per_template": [self._of(index) | {"median_sigma": _named(median[index])} for index in range(len(status))],
             "versions": versions(),
         }
@@ -72,8 +76,9 @@ class Tally:
         found = int(self._found[template])
         lost_at = [int(each[template]) if each[template] != _NEVER else None for each in (self._first, self._last)]
         return {
-            "status": _counted(self._codes["status"][template], self._names),
-            "reasons": _counted(self._codes["reason"][template], self._reasons),
+            "status": self._counted("status", template),
+            "reasons": self._counted("reason", template),
+            "origins": self._counted("origin", template),
             "lost_frames": self._frames - found,
             "first_lost_frame": lost_at[0],
             "last_lost_frame": lost_at[1],
@@ -82,6 +87,16 @@ class Tally:
             "least_coverage": float(self._least[template]) if found else None,
             "last_displacement": _named(self._drift[template]),
         }
+
+    def _saying(self, *words: str) -> list[int]:
+        """The codes of status with one of these ``words``."""
+        return [code for code, word in self._names["status"].items() if word in words]
+
+    def _counted(self, field: str, template: int | None = None) -> dict[str, int]:
+        """How often each word of a ``field`` stands, of one template or of all, without those that never do."""
+        counts = self._codes[field].sum(0) if template is None else self._codes[field][template]
+        names = self._names[field]
+        return {names[code]: int(counts[code]) for code in np.flatnonzero(counts).tolist() if names[code]}
 
 
 def _ends(yes: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -100,11 +115,6 @@ def write_json(path: Path, summary: dict[str, object]) -> None:
     """Strict JSON: what is not finite becomes null, what JSON does not know becomes its text."""
     with create(path) as file:
         append(file, (json.dumps(plain(summary), indent=2, allow_nan=False) + "\n").encode())
-
-
-def _counted(counts: NDArray[np.int64], names: StatusNames | ReasonNames) -> dict[str, int]:
-    """How often each word stands, of (K,) counts of the codes, without those that have none."""
-    return {names[code]: int(counts[code]) for code in np.flatnonzero(counts).tolist() if names[code]}
 
 
 def _describe(error: BaseException | None) -> str | None:

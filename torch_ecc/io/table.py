@@ -30,7 +30,7 @@ def _columns(*, timed: bool, named: bool, micrometres: bool) -> dict[str, str]:
         | {f"d{name}": number for name, number in pose.items()}
         | ({"dx_um": _XY, "dy_um": _XY} if micrometres else {})
         | {f"sigma_{name}": _SHORT for name in pose}
-        | {"score": "%.6f", "status": "%s", "reason": "%s", "iterations": "%d"}
+        | {"score": "%.6f", "status": "%s", "reason": "%s", "origin": "%s", "iterations": "%d"}
         | {"residual_rms": _SHORT, "coverage": "%.3f", "damage": "%s"}
     )
 
@@ -48,10 +48,8 @@ class Table:
         own = {name: _NOTHING if name.endswith(_OF_POSES) else number for name, number in columns.items()}
         self._lost = ",".join(own.values()) + "\n"
 
-    def rows(
-        self, frame: Frame, arrays: Mapping[str, NDArray[Any]], status: Sequence[str], reason: Sequence[str]
-    ) -> str:
-        """The rows of one frame: R templates, those without a pose NaN."""
+    def rows(self, frame: Frame, arrays: Mapping[str, NDArray[Any]], *said: Sequence[str]) -> str:
+        """The rows of one frame: R templates, those without a pose NaN; their words for status, reason and origin."""
         time = "" if frame.time_s is None else f"{frame.time_s:.9f}"
         own = [quoted(frame.name)] * self._named + [time] * self._timed
         um = (arrays["displacement_um"],) if "displacement_um" in arrays else ()
@@ -59,9 +57,8 @@ class Table:
         last = (arrays[name].tolist() for name in ("score", "iterations", "residual_rms", "coverage"))
         damage = quoted(frame.damage or "")
         return "".join(
-            (self._lost if isnan(row[0]) else self._row)
-            % (frame.number, k, *own, *row, score, word, why, *tail, damage)
-            for k, (row, word, why, score, *tail) in enumerate(zip(numbers, status, reason, *last, strict=True))
+            (self._lost if isnan(row[0]) else self._row) % (frame.number, k, *own, *row, score, *words, *tail, damage)
+            for k, (row, words, score, *tail) in enumerate(zip(numbers, zip(*said, strict=True), *last, strict=True))
         )
 
 

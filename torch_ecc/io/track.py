@@ -24,20 +24,29 @@ from torch import Tensor
 from torch_ecc.io.frames import Frame
 from torch_ecc.io.journal import Form, Journal, Unfinished
 from torch_ecc.io.output import check_folder, create, part, publish
-from torch_ecc.io.records import CONVERGED, DOUBTFUL, ReasonNames, Record, StatusNames, to_arrays, words
+from torch_ecc.io.records import (
+    CONVERGED,
+    DOUBTFUL,
+    OriginNames,
+    ReasonNames,
+    Record,
+    StatusNames,
+    to_arrays,
+    words,
+)
 from torch_ecc.io.summary import Tally, write_json
 
 FILES = ("track.csv", "track.npz", "summary.json")
-NO_REASON = {0: ""}
+NO_REASON, NO_ORIGIN = {0: ""}, {0: ""}
 
 
 class TrackWriter:
     """Context manager: ``write`` each frame's record, and find track.csv, track.npz and summary.json in ``out_dir``.
 
-    ``status_names`` is the word for each status code, ``reason_names`` that for each reason; ``fps`` in Hz is the time
-    of frames that bring none of their own; ``um_matrix`` (2, 2), which takes a displacement (dx, dy) in px to
-    micrometres, adds the columns dx_um and dy_um; ``settings`` goes into summary.json. ``unfinished``: what a run
-    before has left, to go on with.
+    ``status_names`` is the word for each status code, ``reason_names`` that for each reason, ``origin_names`` that
+    for how a pose was come by; ``fps`` in Hz is the time of frames that bring none of their own; ``um_matrix`` (2, 2),
+    which takes a displacement (dx, dy) in px to micrometres, adds the columns dx_um and dy_um; ``settings`` goes into
+    summary.json. ``unfinished``: what a run before has left, to go on with.
 
     Where a template was lost its pose and displacement are NaN, empty in the table: an old pose would look like a stop.
 
@@ -53,6 +62,7 @@ class TrackWriter:
         *,
         status_names: StatusNames,
         reason_names: ReasonNames = NO_REASON,
+        origin_names: OriginNames = NO_ORIGIN,
         fps: float | None = None,
         um_matrix: Tensor | None = None,
         settings: Mapping[str, object] | None = None,
@@ -63,7 +73,7 @@ class TrackWriter:
             raise ValueError(f"TrackWriter: fps must be a positive number, got {fps}")
         if um_matrix is not None and tuple(um_matrix.shape) != (2, 2):
             raise ValueError(f"TrackWriter: um_matrix must be (2, 2), got {tuple(um_matrix.shape)}")
-        self.status_names, self.reason_names = dict(status_names), dict(reason_names)
+        self.names = {"status": dict(status_names), "reason": dict(reason_names), "origin": dict(origin_names)}
         self.fps, self.settings = fps, dict(settings or {})
         self.um_matrix = None if um_matrix is None else um_matrix.detach().cpu().numpy().astype("f8")
         self._journal = None if unfinished is None else Journal.go_on(self.out_dir, unfinished)
@@ -80,18 +90,18 @@ class TrackWriter:
         if frame is None:
             frame = Frame(self.frames, None, None if self.fps is None else self.frames / self.fps)
         arrays = to_arrays(record)
-        status = words(arrays["status"], self.status_names)
-        reason = words(arrays["reason"], self.reason_names, "reason")
+        status, reason, origin = (words(arrays[field], names, field) for field, names in self.names.items())
         lost = [word not in (CONVERGED, DOUBTFUL) for word in status]
         if any(lost):
             arrays["pose"][lost] = arrays["displacement"][lost] = np.nan
+            origin = ["" if without else word for without, word in zip(lost, origin, strict=True)]
         if self.um_matrix is not None:
             arrays["displacement_um"] = arrays["displacement"][:, :2] @ self.um_matrix.T
         if self._journal is None:
             timed, micrometres = frame.time_s is not None, "displacement_um" in arrays
             form = Form(len(status), timed, bool(frame.name), micrometres, len(state))
             self._journal = Journal.begin(self.out_dir, form, self.settings)
-        self._journal.append(arrays, (status, reason), frame, state)
+        self._journal.append(arrays, (status, reason, origin), frame, state)
 
     def __enter__(self) -> Self:
         self._started, self._before = time.perf_counter(), self.frames
@@ -121,7 +131,7 @@ class TrackWriter:
         seconds = time.perf_counter() - self._started
         with BufferedWriter(create(part(self.out_dir, "track.npz"))) as file:
             _write_npz(file, journal, self._constants())
-        tally = Tally(journal.form.templates, journal.frames, self.status_names, self.reason_names)
+        tally = Tally(journal.form.templates, journal.frames, self.names)
         for records in journal.blocks():
             tally.add(records)
         summary = tally.summary(error)
@@ -137,12 +147,10 @@ class TrackWriter:
             journal.remove()
 
     def _constants(self) -> dict[str, NDArray[Any]]:
-        constants = {
-            "status_codes": np.array(list(self.status_names), np.int8),
-            "status_names": np.array(list(self.status_names.values())),
-            "reason_codes": np.array(list(self.reason_names), np.int8),
-            "reason_names": np.array(list(self.reason_names.values())),
-        }
+        constants: dict[str, NDArray[Any]] = {}
+        for field, names in self.names.items():
+            constants[f"{field}_codes"] = np.array(list(names), np.int8)
+            constants[f"{field}_names"] = np.array(list(names.values()))
         return constants if self.um_matrix is None else constants | {"um_matrix": self.um_matrix}
 
 

@@ -26,6 +26,7 @@ from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, chec
 from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told
+from torch_ecc.track.light import told_of_light
 from torch_ecc.track.look import Look
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
@@ -340,6 +341,7 @@ class Tracker(nn.Module):
         if not doubtful and apart is estimate:
             return self._learned(image, advanced(state, estimate), [False] * len(start))
         suspects = suspect(apart, state["score"])
+        apart = told_of_light(apart, images[0], state, self.references[0].grid.sides)
         return self._learned(image, advanced_in_doubt(state, apart, suspects), suspects)
 
     def _within_reach(self, estimate: Estimate) -> Estimate:
