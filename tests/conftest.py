@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -19,6 +20,11 @@ settings.load_profile("untimed")
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # the fused engine's kernels, before they are imported
 torch.set_num_threads(1)  # small tensors: a second thread costs more than it brings
+
+
+def pytest_collection_finish() -> None:
+    """What has been imported by now stays: it need not be looked through for what may go."""
+    gc.freeze()
 
 
 def devices() -> list[str]:

@@ -19,7 +19,7 @@ from torch_ecc.sim.scene.scene import PlaneWaves
 from torch_ecc.track.advance import FARTHEST, beginning, coast
 from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.recover import Past, Recovery, strained
+from torch_ecc.track.recover import Past, Recovery, plausible, strained
 from torch_ecc.track.together import common_motion, gone_together
 
 FRAME = (240, 320)
@@ -170,6 +170,17 @@ def test_a_lesser_look_alike_stands_in_no_ones_way():
         assert estimate.status == status
         if mark:
             assert (estimate.displacement[0, :2] - torch.tensor([24.0, 0.0])).abs().max() < 0.1
+
+
+@pytest.mark.parametrize(("share", "off", "kept"), [(0.85, 3.0, True), (0.75, 3.0, False), (0.85, 6.0, False)])
+def test_a_place_is_kept_that_looks_about_as_usual_about_where_it_was_expected(share, off, kept):
+    """Else what looks unlike itself is searched for in the whole frame."""
+    frame = still((0, 0, 0))[0]
+    tracker = Tracker(frame, [(160.0, 120.0)], 61)
+    estimate, past = tracker(frame), Past.of(tracker.state_dict())
+    moved = estimate.pose + torch.tensor([[off, 0.0, 0.0]])
+    less = estimate._replace(pose=moved, score=share * past.usual.to(estimate.score))
+    assert bool(plausible(less, estimate.pose, past, tracker.references[0].place.radius)) == kept
 
 
 def test_a_leap_is_no_velocity():

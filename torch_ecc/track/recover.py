@@ -34,7 +34,7 @@ from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.textureless import least_contrast, textureless
 from torch_ecc.track.together import TOGETHER, gone_together
 
-FAMILIAR = 0.8  # share of its usual score that a template must have to count as found by a search
+FAMILIAR = 0.8  # of its usual score: what has less where it was tracked to is searched for in the whole frame
 AT_ONCE = 4  # templates searched for in the whole of one frame; the others in turn
 KEPT = 2**25  # complex numbers prepared for searches of the whole frame, 256 MB
 NEARBY_AT_ONCE = 64  # and near where they are expected
