@@ -19,7 +19,7 @@ from torch import Tensor
 
 import torch_ecc as te
 from torch_ecc import servo
-from torch_ecc.core import ambient
+from torch_ecc.core import ambient, fused
 from torch_ecc.sim.scene.scene import PlaneWaves
 
 BACKENDS = ("native", "torch")
@@ -155,6 +155,7 @@ QUICK = [name for name in CALLS if name not in {"Tracker, native", "Tracker, tor
 def caches() -> list:
     """Of constants, all but the compiled engine's."""
     names = [m.name for m in pkgutil.walk_packages(te.__path__, "torch_ecc.") if m.name.split(".")[1] in FLOORS]
+    names = [name for name in names if fused.installed() or not name.startswith("torch_ecc.core.fused.")]  # which need Triton
     values = [value for name in names for value in vars(importlib.import_module(name)).values()]
     return [v for v in values if hasattr(v, "cache_clear") and v.__module__ != "torch_ecc.core.native.library"]
 

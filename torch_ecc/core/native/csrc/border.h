@@ -86,12 +86,12 @@ void gram(const std::vector<float>& w, const std::vector<float>& A, const std::v
       for (int64_t k = 0; k < n; ++k) of_a[k] = w[first + k] * A[a[i] * size + first + k];
       for (int64_t j = 0; j < columns; j += AT_ONCE) {
         const float* of_b[AT_ONCE];
-        Vector sum[AT_ONCE] = {};
+        Wide sum[AT_ONCE] = {};
         for (int64_t l = 0; l < AT_ONCE; ++l) of_b[l] = B.data() + b[std::min(j + l, columns - 1)] * size + first;
-        for (int64_t k = 0; k < n; k += LANES)
-          for (int64_t l = 0; l < AT_ONCE; ++l) sum[l] += load<Vector>(of_a + k) * load<Vector>(of_b[l] + k);
+        for (int64_t k = 0; k < n; k += WIDEST)
+          for (int64_t l = 0; l < AT_ONCE; ++l) sum[l] += load<Wide>(of_a + k) * load<Wide>(of_b[l] + k);
         for (int64_t l = 0; l < std::min(AT_ONCE, columns - j); ++l)
-          for (int lane = 0; lane < LANES; ++lane) out[i][j + l] += double(sum[l][lane]);
+          for (int lane = 0; lane < WIDEST; ++lane) out[i][j + l] += double(sum[l][lane]);
       }
     }
 }

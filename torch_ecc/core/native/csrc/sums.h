@@ -1,7 +1,5 @@
 // Sums over the pixels of a template: of its columns Z times a patch, and of what is left of the last one.
 #pragma once
-#include <numeric>
-
 #include "template.h"
 
 namespace ecc {
@@ -99,9 +97,9 @@ inline void add_up(const Template& t, const Pixels& p, const Weights& w, int64_t
                    Model& m, float* lines) {
   add_down<false>(t, p, w, first, rows, g, m, lines);
   const auto add = [&](int line, double& total) {
-    Vector sum{};
-    for (int64_t i = 0; i < p.pitch; i += LANES) sum += load<Vector>(lines + line * p.line() + i);
-    for (int l = 0; l < LANES; ++l) total += double(sum[l]);
+    Wide sum{};
+    for (int64_t i = 0; i < p.pitch; i += WIDEST) sum += load<Wide>(lines + line * p.line() + i);
+    for (int l = 0; l < WIDEST; ++l) total += double(sum[l]);
   };
   for (int k = 0; k < t.lines(); ++k) add(k, m.sums[k]);
   add(t.lines() + 6, m.square);
@@ -114,15 +112,26 @@ inline std::array<double, 2> rescaled(const Pixels& p, int k) {
 
 inline double finite(double value) { return std::isfinite(value) ? value : 0; }
 
+// Sum of n values, in some lanes at once: of one order too.
+template <class Value>
+double added_up(int64_t n, Value value) {
+  constexpr int64_t AT_ONCE = 8;
+  double sum[AT_ONCE] = {}, total = 0;
+  int64_t i = 0;
+  for (; i + AT_ONCE <= n; i += AT_ONCE)
+    for (int64_t l = 0; l < AT_ONCE; ++l) sum[l] += value(i + l);
+  for (; i < n; ++i) total += value(i);
+  for (double part : sum) total += part;
+  return total;
+}
+
 // Square sum over lines of n values, from one to the next of which it is `step`, and `next` from line to line.
 inline double squares(const float* from, int64_t lines, int64_t next, int64_t n, int64_t step) {
-  double square = 0;
-  for (int64_t k = 0; k < lines; ++k) {
+  return added_up(lines, [&](int64_t k) {
     double sum = 0;
     for (int64_t i = 0; i < n; ++i) sum += double(from[k * next + i * step]);
-    square += sum * sum;
-  }
-  return square;
+    return sum * sum;
+  });
 }
 
 // sums (SUMS, blocks) of the last patch and its fit, as of solution.summed, and their total (SUMS + CLUSTERS).
@@ -158,7 +167,9 @@ inline void summed(const Template& t, const Pixels& p, const Weights& seen, cons
   sums -= count;
   const auto added = [&](int k) {
     const float* const row = sums + k * count;
-    return k < SUMS - 3 && p.trust ? std::inner_product(row, row + count, p.trust, 0.0) : std::accumulate(row, row + count, 0.0);
+    const float* const trust = k < SUMS - 3 ? p.trust : nullptr;
+    return trust ? added_up(count, [&](int64_t i) { return double(row[i] * trust[i]); })
+                 : added_up(count, [&](int64_t i) { return double(row[i]); });
   };
   const double level = m.mean + m.base, power = added(2);
   if (!(power > ECC_FLAT * (power + level * level * w.total)))  // of a patch that is flat but for rounding g0 is 0

@@ -15,6 +15,8 @@ constexpr int LANES = 16;
 constexpr int LANES = 8;
 #endif
 typedef float Vector __attribute__((vector_size(4 * LANES)));
+constexpr int WIDEST = 16;  // lanes of sums: of one order, and so of one rounding, whatever the processor's vectors are
+typedef float Wide __attribute__((vector_size(4 * WIDEST)));
 typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
 typedef int16_t Shorts __attribute__((vector_size(2 * LANES)));
 
@@ -42,7 +44,7 @@ Vector after(const Vector& a, const Vector& b) {
 
 inline void store(const Vector& values, float* to) { std::memcpy(to, &values, sizeof values); }
 
-inline int64_t padded(int64_t n) { return (n + LANES - 1) / LANES * LANES; }
+inline int64_t padded(int64_t n) { return (n + WIDEST - 1) / WIDEST * WIDEST; }
 
 struct Frame {  // rows of one grey frame where they are: uint8, uint16 or float32, told by its bytes
   const char* data;
