@@ -155,7 +155,8 @@ QUICK = [name for name in CALLS if name not in {"Tracker, native", "Tracker, tor
 def caches() -> list:
     """Of constants, all but the compiled engine's."""
     names = [m.name for m in pkgutil.walk_packages(te.__path__, "torch_ecc.") if m.name.split(".")[1] in FLOORS]
-    names = [name for name in names if fused.installed() or not name.startswith("torch_ecc.core.fused.")]  # which need Triton
+    if not fused.installed():  # its kernels need Triton
+        names = [name for name in names if not name.startswith("torch_ecc.core.fused.")]
     values = [value for name in names for value in vars(importlib.import_module(name)).values()]
     return [v for v in values if hasattr(v, "cache_clear") and v.__module__ != "torch_ecc.core.native.library"]
 

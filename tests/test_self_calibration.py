@@ -127,7 +127,7 @@ def test_a_command_that_was_not_obeyed_is_named(tracker):
     moved = path("circle", 6)
     sent = STAGE.to_physical(moved)[:, :2]
     sent[2] += sent.norm(dim=1).max()
-    with pytest.raises(ValueError, match="do not tell .*commanded positions do not fit, number 2 of .* is off by"):
+    with pytest.raises(ValueError, match=r"do not tell .*commanded positions do not fit, number 2 of .* is off by"):
         calibrate(seen(tracker, moved), sent, tracker=tracker, lens=[])
 
 
