@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import constant
+from torch_ecc.core.grid import Grid
 from torch_ecc.core.normal import LEAST, Normal
-from torch_ecc.core.reference import Grid, Reference, each
+from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.solution import SUMS, Solution, clustered
 from torch_ecc.core.strain import Strains, strained_by, strained_pose, strains_of, without_strain

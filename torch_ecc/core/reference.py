@@ -29,9 +29,10 @@ from torch_ecc.core.blocks import Blocks, Parts, blocks_of, parts_of
 from torch_ecc.core.columns import Columns, columns_of
 from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
+from torch_ecc.core.grid import Grid, Place, grid_of, place_of
 from torch_ecc.core.noise import DIM_BLURS, INSTRUMENT_BLUR, NOISE_SHARE, Noise, blurred, template_noise
 from torch_ecc.core.normal import Moments, Normal, normal_equations
-from torch_ecc.core.pose import pose_dtype, rotation
+from torch_ecc.core.pose import rotation
 from torch_ecc.core.sampling import SAMPLERS, aliasing, gradients, pad
 from torch_ecc.core.strain import Strains, strains_of
 
@@ -43,38 +44,11 @@ MARGIN = 8  # px that a template is continued by before it is differentiated and
 ENOUGH = 1500  # pixels of a template tell well where to go; the first iterations leave out others in x and y
 SPARSEST = 4  # px between those that are kept
 FAINT = 0.25  # px: by so much noise may move the farthest pixel in an iteration of them
-BLOCK = 6  # px: side of the blocks over which the last look at a patch is summed
 PIXELS_AT_ONCE = 2**17  # of templates that are prepared together, each of which takes some 600 bytes on the way
 NARROW = 8  # times the blur of its instruments: no template is as narrow
 SMALLEST = 5  # px: side of the smallest template
 
 Fields = TypeVar("Fields", bound=tuple[object, ...])
-
-
-class Grid(NamedTuple):
-    """Where the pixels of all templates lie: ``pixels`` (3, N), homogeneous, relative to the middle of the template
-    array; ``box`` (3, 4), the corners of their bounding box, and ``sides`` (2,), how many of them it is wide and high;
-    ``block`` (N,), the number of the block that a pixel is in, of ``blocks`` = (rows, columns) of them, of which
-    ``occupied`` hold a pixel."""
-
-    pixels: Tensor
-    box: Tensor
-    sides: Tensor
-    block: Tensor
-    blocks: tuple[int, int]
-    occupied: int
-
-
-class Place(NamedTuple):
-    """What the poses of B templates speak of: ``centre`` (B, 2), the point x' = 0 in the grid's coordinates; ``radius``
-    (B,) px from there to the farthest pixel; ``lever`` (B, 3): by how many px an increment of 1 in x, y, theta moves
-    that pixel, and its square; ``unit`` (B, 2, 3) takes pixels to positions about the centre over half the box."""
-
-    centre: Tensor
-    radius: Tensor
-    lever: Tensor
-    lever2: Tensor
-    unit: Tensor
 
 
 class Sight(NamedTuple):
@@ -298,11 +272,11 @@ def _instrumented(criterion: Criterion, given: Sequence[Tensor], used: Tensor, i
     def counted(images: Tensor) -> Tensor:  # (B, k, h, w) to (B, k, N)
         return images[:, :, MARGIN:-MARGIN, MARGIN:-MARGIN].flatten(2)[:, :, used]
 
-    grid, wide = _grid(used, gray), pad(gray, MARGIN)
+    grid, wide = grid_of(used, gray), pad(gray, MARGIN)
     soft, slopes, wiener = blurred(wide, MARGIN, noise, instrument_blur)
     wiener = counted(wiener)
     weight = kept.flatten(1)[:, used]
-    place = _place(grid, centre, weight)
+    place = place_of(grid, centre, weight)
     images = (
         torch.cat((counted(slopes) * wiener, counted(soft)), 1),
         torch.cat((counted(gradients(wide)), counted(wide)), 1),
@@ -314,29 +288,6 @@ def _instrumented(criterion: Criterion, given: Sequence[Tensor], used: Tensor, i
             shift = reference.K[:, :3] @ counted(aliasing(wide, name)).mT
             reference.noise.alias[name] = shift.to(place.radius.dtype) / 2**0.5
     return reference
-
-
-def _grid(used: Tensor, image: Tensor) -> Grid:
-    """The grid of the pixels ``used`` (h w,) of an ``image`` (B, 1, h, w)."""
-    axes = (torch.arange(n, device=image.device, dtype=image.dtype) - (n - 1) / 2 for n in image.shape[-2:])
-    y, x = (axis.flatten()[used] for axis in torch.meshgrid(*axes, indexing="ij"))
-    (left, right), (top, bottom) = ((float(v.min()), float(v.max())) for v in (x, y))
-    box = image.new_tensor([[left, right, right, left], [top, top, bottom, bottom], [1, 1, 1, 1]])
-    column, row = ((x - left) / BLOCK).long(), ((y - top) / BLOCK).long()
-    blocks = (int(bottom - top) // BLOCK + 1, int(right - left) // BLOCK + 1)
-    block = row * blocks[1] + column
-    sides = (box[:2, 2] - box[:2, 0] + 1).to(pose_dtype(image.device))
-    pixels, occupied = torch.stack((x, y, torch.ones_like(x))), int((torch.bincount(block) > 0).sum())
-    return Grid(pixels, box, sides, block, blocks, occupied)
-
-
-def _place(grid: Grid, centre: Tensor, weight: Tensor) -> Place:
-    local = grid.pixels[:2] - centre[:, :, None]
-    radius = (local.square().sum(1) * (weight > 0)).amax(-1).sqrt().to(pose_dtype(centre.device))
-    lever = torch.stack((torch.ones_like(radius), torch.ones_like(radius), radius), -1)
-    half = (grid.box[:2, 2] - grid.box[:2, 0]).clamp(min=1.0)[:, None] / 2
-    one = torch.eye(2, dtype=half.dtype, device=half.device).expand(len(centre), 2, 2)
-    return Place(centre, radius, lever, lever.square(), torch.cat((one, -centre[:, :, None]), -1) / half)
 
 
 def _coarser(reference: Reference) -> Reference | None:

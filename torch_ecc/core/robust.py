@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.blocks import Blocks
+from torch_ecc.core.grid import BLOCK
 from torch_ecc.core.normal import LEAST
-from torch_ecc.core.reference import BLOCK, Reference, each
+from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust

@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.frame import PIXEL_DTYPES, require_tensor
-from torch_ecc.core.reference import BLOCK, Reference, Sight, each
+from torch_ecc.core.grid import BLOCK
+from torch_ecc.core.reference import Reference, Sight, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust

@@ -15,9 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.criteria import Criterion, safe_inverse
+from torch_ecc.core.grid import BLOCK
 from torch_ecc.core.normal import LEAST
 from torch_ecc.core.pose import pose_dtype
-from torch_ecc.core.reference import BLOCK
 from torch_ecc.core.sampling import gradients
 
 AROUND = 1e-3  # weight of what surrounds a template: it is fitted and told apart, but fixes nothing

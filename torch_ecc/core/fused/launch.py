@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torch_ecc.core.fused import kernel, look
 from torch_ecc.core.fused.records import OF_LOOK, Answers, Frames, Grids, Trusted, Way
+from torch_ecc.core.grid import BLOCK
 from torch_ecc.core.native.engine import DEGREE
 from torch_ecc.core.native.entry import How
 from torch_ecc.core.native.packed import Packed
-from torch_ecc.core.reference import BLOCK
 from torch_ecc.core.sampling import Sampler
 from torch_ecc.core.solution import Trust
 

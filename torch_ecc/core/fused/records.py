@@ -10,9 +10,9 @@ import triton.language as tl
 
 from torch_ecc.core import sampling, solution, solver, step
 from torch_ecc.core.columns import LEVELS
+from torch_ecc.core.grid import BLOCK
 from torch_ecc.core.native.packed import MOMENTS, MOST, NUMBERS
 from torch_ecc.core.normal import LEAST
-from torch_ecc.core.reference import BLOCK
 
 SIDE, PLACES = tl.constexpr(BLOCK), tl.constexpr(MOST)
 SUMS, CLUSTERS = tl.constexpr(solution.SUMS), tl.constexpr(solution.CLUSTERS)

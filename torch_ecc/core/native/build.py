@@ -32,7 +32,7 @@ SECONDS = 600  # a compiler that takes longer is given up
 CONSTANTS = {  # of the Python modules, for the C++
     "native.packed": ["MOST", "PLANES", "NUMBERS", "MOMENTS"],
     "columns": ["LEVELS"],
-    "reference": ["BLOCK"],
+    "grid": ["BLOCK"],
     "sampling": ["ROUNDING"],
     "solution": ["CLUSTERS", "FLAT", "SUMS"],
     "solver": ["COARSE_TOLERANCE"],

@@ -16,7 +16,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.columns import LEVELS
-from torch_ecc.core.reference import BLOCK, Reference
+from torch_ecc.core.grid import BLOCK
+from torch_ecc.core.reference import Reference
 from torch_ecc.core.solution import CLUSTERS, SUMS
 
 LANES = 16  # pixels of the widest vector that an engine reads rows in: their pitch is a multiple of it
