@@ -3,11 +3,12 @@ true of it before any work. Loaded into the workers here, it leaves Ctrl-C to th
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
 import logging
 import secrets
 import signal
 import sys
-from asyncio import CancelledError
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from torch_ecc.io.summary import versions
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
 
+CANCELLED = (asyncio.CancelledError, concurrent.futures.CancelledError)  # either, when a scheduler goes
 PATIENCE = 20.0  # s to wait for a scheduler, and for its first worker
 CLOSING = 3.0  # s that it may take to say goodbye
 GPU = "GPU"  # the resource that a worker with one has
@@ -146,7 +148,7 @@ def _wait_for_one(client: Client, late: Callable[[], None]) -> None:
         except Late:
             late()
             first.result()
-    except CancelledError as error:
+    except CANCELLED as error:
         raise ConnectionError("scheduler: it is gone") from error
 
 

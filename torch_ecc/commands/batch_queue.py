@@ -10,14 +10,13 @@ from __future__ import annotations
 import math
 import secrets
 import time
-from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from torch_ecc.commands.batch_cluster import GPU
+from torch_ecc.commands.batch_cluster import CANCELLED, GPU
 from torch_ecc.commands.batch_unit import FAILED, UNFINISHED, Row, Work, row_of
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ class Queue:
             withdraw()
             self._wind_up()
             raise
-        except (OSError, RuntimeError, CancelledError) as error:  # what Dask says before it knows that nobody is there
+        except (OSError, RuntimeError, *CANCELLED) as error:  # what Dask says before it knows that nobody is there
             if isinstance(error, RuntimeError) and client.status == "running":
                 raise
             self._again.extend(self._out.values())
