@@ -106,8 +106,9 @@ def test_some_of_many_are_solved_as_they_are_alone():
 
 
 def test_align_with_it():
-    """By name: the record is the page's, of a robust solve too."""
+    """By name: the record is the page's, of a robust solve too, and of a frame whose pixels lie column by column."""
     reference, image, start = on(*Problem((13, 17), 1).made(CRITERIA[1]))
+    image = image.mT.contiguous().mT
     a, b = (align(reference, image, start, backend=name, max_iterations=5) for name in ("fused", "torch"))
     assert a.status == b.status == Status.CONVERGED
     for name in ("pose", "covariance", "score", "residual_rms"):
