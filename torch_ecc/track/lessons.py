@@ -29,6 +29,7 @@ from torch_ecc.track.surface import Surface, news, pixels, with_contrast
 HIGH = 0.75  # coverage: with less a frame teaches nothing
 SHARE = 0.5  # of a round's frames must have shown a pixel: else it stays what it was
 AGES = 7  # older means that are kept
+CHANGED = 0.02  # correlation: so much less alike to the first mean than to the last one, it is no more the same
 UNLIKE = 0.2  # correlation: the first mean tells nothing of a template less like it
 PASSES = 2  # in which means are placed among each other
 AT_ONCE = 4  # templates that are renewed together
@@ -221,13 +222,16 @@ class Teacher:
         images, step = torch.cat((lessons.older[which], new), 1), torch.zeros_like(lessons.lag[which, 0])
         noise, there = lessons.noise[which].square() / lessons.learned[which], present(lessons.held[which])
         counted, centre = crop.mask[which] * enough, crop.centre[which]
+        alike, needed = list[Tensor](), there
         for _ in range(PASSES):
-            found = placed(images, there, noise, counted, centre)
+            found = placed(images, needed, noise, counted, centre)
             off, about = found.step.nan_to_num(0.0, 0.0, 0.0), centre.repeat_interleave(AGES + 1, 0)
             each = shifted(images.flatten(0, 1)[:, None], self.interpolation, off.flatten(0, 1), about)
             images, step = each.view_as(images), step + off[:, -1]
+            alike.append(found.alike)
+            needed = telling(there, alike[0])
         trust(which, step, found.covariance[:, -1], lessons)
-        remember(which, images, there, found, lessons)
+        remember(which, images, there, found._replace(alike=alike[0]), lessons)
         return images[:, -1:]
 
 
@@ -248,6 +252,15 @@ def present(held: Tensor) -> Tensor:
     """Which of the older means, and a new one, there are, (n, AGES + 1) bool, if so many are ``held`` (n,)."""
     older = torch.arange(AGES, device=held.device) < held[:, None]
     return torch.nn.functional.pad(older, (0, 1), value=True)
+
+
+def telling(there: Tensor, alike: Tensor) -> Tensor:
+    """Which of the means that are ``there`` (n, AGES + 1) bool tell where the last one lies: all of them, or, where it
+    is as ``alike`` (n, AGES + 1, AGES + 1) to the first one as to that before it, the first one alone. Then nothing has
+    changed, and their own noise would only add up."""
+    before = alike[:, -1].gather(1, (there.sum(1, keepdim=True) - 2).clamp(min=0))
+    number = torch.arange(AGES + 1, device=there.device)
+    return there & ((alike[:, -1, :1] < before - CHANGED) | (number == 0) | (number == AGES))
 
 
 def remember(which: Tensor, images: Tensor, there: Tensor, found: Places, lessons: Lessons) -> None:

@@ -1,9 +1,7 @@
-"""A template as a surface that changes: what a frame shows of it that is new, and how far one mean of frames lies from
-another although its texture is no longer the same.
+"""A template as a surface that changes: what a frame shows of it that is new, in the template's own light.
 
-Both are fits over all pixels of the template image, with what surrounds it. Texture that has come and gone leaves a
-residual as coarse as texture is, which drags plain least squares along. How far two means of frames are apart is told
-by generalised least squares, in which every frequency counts by how little of the residual it holds.
+A fit over all pixels of the template image, with what surrounds it. How far means of frames lie from each other,
+although their texture is no longer the same, is told by ``track.ages``.
 """
 
 from __future__ import annotations
@@ -21,10 +19,6 @@ from torch_ecc.core.pose import pose_dtype
 from torch_ecc.core.sampling import gradients
 
 AROUND = 1e-3  # weight of what surrounds a template: it is fitted and told apart, but fixes nothing
-QUICK = 16  # px: sides that are whole multiples of it are transformed quickly
-SMOOTH = 7  # frequencies in x and in y over which a spectrum is averaged
-DARKEST = 1e-4  # of a spectrum's largest value: no frequency counts as if there were less
-CLUSTER = 12  # px: side of blocks in which residuals may cling together
 SUDDEN = 0.2  # of the template's contrast, and
 UNLIKELY = 4.0  # times the median square: what is left beyond both has covered the surface, not changed it
 
