@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_ecc import Status, Tracker
 from torch_ecc.core.dead_lines import dead_lines
-from torch_ecc.core.sampling import blur
+from torch_ecc.core.filters import blur
 from torch_ecc.sim import Pads, PlaneWaves
 
 FRAME, MIDDLE, SIZE = (220, 230), (110.0, 105.0), 91

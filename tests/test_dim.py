@@ -11,7 +11,7 @@ from torch import Tensor
 import torch_ecc as te
 from torch_ecc import Reason, Status
 from torch_ecc.core import pushed
-from torch_ecc.core.sampling import blur
+from torch_ecc.core.filters import blur
 from torch_ecc.sim import micrograph
 
 SIZE, SIDE, MOVED = 151, 200, (1.4, -0.6)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_ecc import Locator, Status, align, prepare
-from torch_ecc.core.sampling import blur
+from torch_ecc.core.filters import blur
 from torch_ecc.search.locate import image_pyramid, with_half_turns
 from torch_ecc.search.matched_filter import whitened_matches
 

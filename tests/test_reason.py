@@ -17,7 +17,7 @@ from torch import Tensor
 from torch_ecc import Estimate, Reason, Status, Track, Tracker, align
 from torch_ecc.cli import app
 from torch_ecc.commands.track import Session, TrackJob
-from torch_ecc.core.sampling import blur
+from torch_ecc.core.filters import blur
 from torch_ecc.sim import Pads, PlaneWaves
 from torch_ecc.track.recover import Past, disbelieved
 

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from torch_ecc import ECC, SSD, PaperECC, prepare
 from torch_ecc.core.criteria import safe_inverse
+from torch_ecc.core.filters import blur
 from torch_ecc.core.noise import INSTRUMENT_BLUR, NOISE_RESPONSE
 from torch_ecc.core.pose import transform
 from torch_ecc.core.reference import reweigh
-from torch_ecc.core.sampling import blur, gradients
+from torch_ecc.core.sampling import gradients
 from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=3)

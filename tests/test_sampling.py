@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torch_ecc.core import filters
 from torch_ecc.core import sampling as S
 from torch_ecc.core.frame import as_gray
 
@@ -110,7 +111,7 @@ def test_gradients_are_the_slope_of_the_spline():
 def test_padding_keeps_the_slope_at_the_border():
     y, x = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
     ramp = (2 * x - 3 * y)[None, None]
-    wide = S.pad(ramp, 8)
+    wide = filters.pad(ramp, 8)
     assert torch.equal(wide[:, :, 8:-8, 8:-8], ramp)
     inner = S.gradients(wide)[0, :, 8:-8, 8:-8]
     assert torch.allclose(inner[0], torch.full_like(inner[0], 2.0), atol=1e-3)
@@ -120,7 +121,7 @@ def test_padding_keeps_the_slope_at_the_border():
 @pytest.mark.parametrize("size", [(40, 50), (41, 51)])
 def test_halving_keeps_every_second_pixel_in_place(size):
     y, x = torch.meshgrid(torch.arange(float(size[0])), torch.arange(float(size[1])), indexing="ij")
-    half = S.downsample((x + 10 * y)[None, None])
+    half = filters.downsample((x + 10 * y)[None, None])
     rows, columns = half.shape[-2:]
     yy, xx = torch.meshgrid(2 * torch.arange(float(rows)), 2 * torch.arange(float(columns)), indexing="ij")
     assert torch.allclose(half[0, 0, 3:-3, 3:-3], (xx + 10 * yy)[3:-3, 3:-3], atol=1e-3)
@@ -140,9 +141,9 @@ def test_noise_level_sees_noise_and_not_ramps_or_edges():
     y, x = torch.meshgrid(torch.arange(100.0), torch.arange(100.0), indexing="ij")
     kept = torch.ones(1, 1, 100, 100)
     for scene in (torch.zeros(100, 100), 3 * x - y, 100 * (x > 50)):
-        assert float(S.noise_level(scene[None, None], kept)) == 0
+        assert float(filters.noise_level(scene[None, None], kept)) == 0
         noisy = (scene + 4 * noise(100, 100))[None, None]
-        assert float(S.noise_level(noisy, kept)) == pytest.approx(4.0, rel=0.08)
+        assert float(filters.noise_level(noisy, kept)) == pytest.approx(4.0, rel=0.08)
 
 
 def test_templates_share_one_image_without_copies():
@@ -158,7 +159,7 @@ def test_blur_is_a_gaussian_mirrored_at_the_border(sigma, shape):
     image = 255 * torch.rand(shape, generator=torch.Generator().manual_seed(0))
     size = 2 * int(4 * sigma + 0.5) + 1
     theirs = kornia.filters.gaussian_blur2d(image, (size, size), (sigma, sigma), border_type="reflect")
-    torch.testing.assert_close(S.blur(image, sigma), theirs, rtol=0, atol=2e-4)
+    torch.testing.assert_close(filters.blur(image, sigma), theirs, rtol=0, atol=2e-4)
 
 
 def test_colours_become_grey_as_another_library_has_it():

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.criteria import centred
+from torch_ecc.core.filters import blur, noise_level, pad
 from torch_ecc.core.pose import pose_dtype
-from torch_ecc.core.sampling import blur, gradients, noise_level, pad
+from torch_ecc.core.sampling import gradients
 
 INSTRUMENT_BLUR = 0.9  # px; 0.7 to 1 serve alike
 DIM_BLURS = (2.0, 4.0)  # px, of templates in which texture is told from noise where it is coarse alone

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.criteria import Criterion, make_criterion
+from torch_ecc.core.filters import pad
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.pose import pose_dtype
 from torch_ecc.core.reference import MARGIN, SMALLEST, Reference, prepare
-from torch_ecc.core.sampling import pad
 from torch_ecc.core.sight import eroded
 from torch_ecc.core.verdict import predicted_sigma
 

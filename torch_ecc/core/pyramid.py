@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_ecc.core.filters import downsample
 from torch_ecc.core.reference import Reference, prepare
-from torch_ecc.core.sampling import downsample
 
 SMALLEST_COARSE = 12  # px: a template is not halved below this side
 LEAST_KEPT = 0.5  # of a coarse pixel must lie under the mask

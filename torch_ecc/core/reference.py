@@ -28,12 +28,13 @@ from torch_ecc.core.ambient import lasting, ordinary
 from torch_ecc.core.blocks import Blocks, Parts, blocks_of, parts_of
 from torch_ecc.core.columns import Columns, columns_of
 from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
+from torch_ecc.core.filters import pad
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.grid import Grid, Place, grid_of, place_of
 from torch_ecc.core.noise import DIM_BLURS, INSTRUMENT_BLUR, NOISE_SHARE, Noise, blurred, template_noise
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.pose import rotation
-from torch_ecc.core.sampling import SAMPLERS, aliasing, gradients, pad
+from torch_ecc.core.sampling import SAMPLERS, aliasing, gradients
 from torch_ecc.core.strain import Strains, strains_of
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Image values between pixels: B-spline and bilinear sampling, gradients, blur and pyramid.
+"""Image values between pixels: B-spline and bilinear sampling, and gradients.
 
 The one place that knows the coordinates of ``grid_sample``. Everywhere else a point is (x, y) in px with
 pixel centres at integers, and a warp is a 2x3 matrix that takes homogeneous template pixels (3, N) to such points.
@@ -20,8 +20,6 @@ from torch_ecc.core.pose import pose_dtype
 
 MARGIN_KEPT = 3  # px: a window serves until a patch comes nearer to its border
 ROUNDING = 1e-6  # px: a pixel on the frame's outermost row is in sight, however its place was rounded
-
-FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65535.0)  # grey levels at which cameras clip
 
 Pairs = list[tuple[int, Tensor, Tensor]]  # of taps: the first one's offset, the sum of both weights, the second weight
 Slopes = list[tuple[Tensor, Tensor]]  # of these two by f
@@ -345,67 +343,3 @@ def _quarter(n: int, interpolation: str) -> Tensor:
         taps[index, _mirror(index + first, n)] += total - second
         taps[index, _mirror(index + first + 1, n)] += second
     return taps @ prefilter_matrix(n, kernel.taps, 0, torch.float32, cpu) if kernel.ring else taps
-
-
-def pad(image: Tensor, margin: int) -> Tensor:
-    """``image`` (B, 1, H, W) continued by ``margin`` px, odd about its border pixels: slopes stay what they are.
-
-    (A mirror image would put a kink at the border and halve the gradient there.)
-    """
-    for dim in (-1, -2):
-        n = image.shape[dim]
-        edges = image.narrow(dim, 0, 1), image.narrow(dim, n - 1, 1)
-        run = torch.arange(1, margin + 1, device=image.device).clamp(max=n - 1)
-        before = 2 * edges[0] - image.index_select(dim, run.flip(0))
-        after = 2 * edges[1] - image.index_select(dim, n - 1 - run)
-        image = torch.cat((before, image, after), dim)
-    return image
-
-
-def blur(image: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of (B, 1, H, W), mirrored at its border; as kornia's, which takes a tenth of a second to import."""
-    radius = int(4 * sigma + 0.5)
-    x = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
-    weights = torch.softmax(-x * x / (2 * sigma**2), 0)
-    image = F.pad(image, (radius, radius, radius, radius), mode="reflect")
-    for dim in (3, 2):  # tap by tap: a convolution first copies the image once for every tap
-        n = image.shape[dim] - 2 * radius
-        total = image.narrow(dim, 0, n) * weights[0]
-        for k in range(1, len(weights)):
-            total.addcmul_(image.narrow(dim, k, n), weights[k])
-        image = total
-    return image
-
-
-def downsample(image: Tensor) -> Tensor:
-    """Next pyramid level of (B, 1, H, W): blurred, and pixel (i, j) of it lies exactly at (2 i, 2 j) of ``image``."""
-    return blur(image, 1.0)[:, :, ::2, ::2]
-
-
-def clipped(image: Tensor) -> Tensor:
-    """Which pixels (B, 1, H, W) are as dark as can be, or as bright, and all their neighbours too."""
-    levels = image.new_tensor(FULL_SCALES)
-    top = image.amax((2, 3), keepdim=True)
-    bright = (image == top) & (top[..., None] == levels).any(-1)
-    extreme = F.pad((image <= 0) | bright, (1, 1, 1, 1), value=True)
-    for dim in (-1, -2):
-        before, here, after = (extreme.narrow(dim, k, extreme.shape[dim] - 2) for k in range(3))
-        extreme = before & here & after
-    return extreme
-
-
-def noise_level(image: Tensor, kept: Tensor) -> Tensor:
-    """Upper estimate of the white noise of (B, 1, H, W) where ``kept`` > 0, grey levels, (B,).
-
-    Median response to the difference of two Laplacians (Immerkaer, 1996), which cancels flat areas, ramps and edges
-    along rows or columns; what fine texture leaves in it counts as noise. Where the image is clipped there is none.
-    """
-    kept = kept * ~clipped(image)
-    response = torch.where(kept[:, :, 1:-1, 1:-1] > 0, noise_samples(image), float("nan"))
-    return response.flatten(1).nanmedian(-1).values.nan_to_num()
-
-
-def noise_samples(image: Tensor) -> Tensor:
-    """What the inner pixels of (B, 1, H, W) say of its noise, whose standard deviation is the median of them: all but
-    the border, (B, 1, H - 2, W - 2)."""
-    return image.diff(n=2, dim=-1).diff(n=2, dim=-2).abs() / (6 * 0.6745)

@@ -16,10 +16,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_ecc.core.filters import blur
 from torch_ecc.core.noise import INSTRUMENT_BLUR
 from torch_ecc.core.pose import rotation
 from torch_ecc.core.reference import MARGIN
-from torch_ecc.core.sampling import Sampler, blur, gradients, make_sampler
+from torch_ecc.core.sampling import Sampler, gradients, make_sampler
 from torch_ecc.core.solver import COARSE_TOLERANCE
 
 PAPER_ITERATIONS = 15  # at most, of every method

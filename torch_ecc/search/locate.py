@@ -19,11 +19,12 @@ from torch_ecc.core.align import engine_for, solve
 from torch_ecc.core.ambient import lasting, plain
 from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Origin, Status
+from torch_ecc.core.filters import downsample
 from torch_ecc.core.frame import as_gray
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.pyramid import pyramid
 from torch_ecc.core.reference import Reference
-from torch_ecc.core.sampling import Sampler, downsample, inside
+from torch_ecc.core.sampling import Sampler, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, picked
 from torch_ecc.core.verdict import within_margin
