@@ -19,7 +19,7 @@ from torch_ecc.sim.scene.scene import PlaneWaves
 from torch_ecc.track.advance import FARTHEST, beginning, coast
 from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.recover import Past, Recovery, plausible, strained
+from torch_ecc.track.recover import Past, Recovery, of_a_part, plausible, strained
 from torch_ecc.track.together import common_motion, gone_together
 
 FRAME = (240, 320)
@@ -446,9 +446,9 @@ def test_a_dark_frame_is_not_searched(monkeypatch):
     monkeypatch.setattr(Recovery, "search_anywhere", lambda self, images, estimate, past, r: estimate)
     rng = np.random.default_rng(0)
     tracker = Tracker(noisy(still((0, 0, 0))[0].numpy(), rng), [(160.0, 120.0), (100.0, 80.0)], 41)
-    for level in (0, 10, 90, 255):
+    for level, reason in ((0, "DARK"), (10, "DARK"), (90, "FLAT"), (255, "CLIPPED")):
         estimate = tracker(noisy(np.full(FRAME, level), rng))
-        assert estimate.reason.tolist() == [te.Reason.FLAT] * 2
+        assert estimate.reason.tolist() == [te.Reason[reason]] * 2
         assert not searched
     tracker(noisy(np.full(FRAME, 90) + 20 * edge(X - 50), rng))
     assert searched
@@ -472,6 +472,23 @@ def test_what_was_hidden_is_not_believed_where_a_look_alike_is_expected(velocity
     estimate = tracker(noisy(image, rng))
     assert estimate.status == Status.CONVERGED
     assert estimate.displacement[0, :2].abs().max() < 0.2
+
+
+def test_of_a_part_is_what_less_than_half_of_a_template_says():
+    """Beyond the border, or not believed; and what is lost is not believed where no more of it is seen."""
+    away = 60.0
+    frames = still((0, 0, 0), start=(away, 120.0, 0.0))
+    tracker = Tracker(frames[0], [(away, 120.0)], 101, search=False)
+    found = tracker(frames[0])
+    for x, coverage, part in ((-8.0, 1.0, True), (8.0, 1.0, False), (20.0, 0.6, True), (100.0, 0.6, False)):
+        there = found._replace(pose=torch.tensor([[x, 120.0, 0.0]]).double(), coverage=torch.tensor([coverage]))
+        assert of_a_part(tracker.references[0], there, FRAME) == part
+    for x, tracked in ((8.0, True), (-8.0, False)):
+        tracker = Tracker(frames[0], [(away, 120.0)], 101)
+        tracker.expect(torch.tensor([[x, 120.0, 0.0]]), torch.zeros(1, 3), torch.tensor([True]))
+        tracker.skip()
+        found = tracker(still((x - away, 0, 0), start=(away, 120.0, 0.0))[0])
+        assert bool((found.status == Status.CONVERGED) & (found.origin == Origin.TRACKED)) == tracked
 
 
 @pytest.mark.parametrize(("off", "lost"), [((3.0, 1.0, 0.0), False), ((50.0, 0.0, 0.0), True), ((0.0, 0.0, 1.5), True)])

@@ -19,7 +19,7 @@ from torch_ecc.io.summary import versions, write_json
 
 TABLE, PICTURE, POSES, FAILURES = "batch.csv", "batch.png", "poses.parquet", ".failed.json"
 TYPES = {"frame": "int64", "template": "int32", "iterations": "int32"}
-WORDS = ("file", "status", "reason", "damage")
+WORDS = ("file", "status", "reason", "origin", "damage")
 
 
 def check_report(job: BatchJob) -> None:

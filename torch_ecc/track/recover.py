@@ -25,7 +25,7 @@ from torch_ecc.core.robust import Memory
 from torch_ecc.core.sampling import inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
-from torch_ecc.core.verdict import expected_score, just_as_good, predicted_sigma, unknown, within_margin
+from torch_ecc.core.verdict import LEAST_COVERAGE, expected_score, just_as_good, predicted_sigma, unknown, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, REACH, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
@@ -108,8 +108,16 @@ def from_rest(reference: Reference, image: Tensor, estimate: Estimate, past: Pas
     part = reference.select(index)
     memory = Memory.none(part)._replace(score=past.usual[index])
     found, _ = solve_again(part, view, past.pose[index], settings, past.home[index], memory)
-    good = Status.good(found.status)
+    good = Status.good(found.status) & ~of_a_part(part, found, (image.shape[2], image.shape[3]))
     return estimate.put(index[good], found.at(good))
+
+
+def of_a_part(reference: Reference, found: Estimate, size: tuple[int, int]) -> Tensor:
+    """Which templates (n,) were ``found`` in a frame of ``size`` by less than half of them, beyond its border or not
+    believed: something else may look like that part."""
+    shown = inside(reference.warps(found.pose.detach()), reference.grid.pixels, size)
+    part: Tensor = found.coverage * (reference.weight * shown).sum(1) < LEAST_COVERAGE * reference.weight.sum(1)
+    return part
 
 
 def disproved(estimate: Estimate, lost: Tensor, reason: Reason) -> Estimate:
@@ -281,7 +289,9 @@ class Recovery:
         if len(index) == 0:
             return estimate
         expected = ~strayed(estimate, start, past, radius, BASIN)[index]
-        lost = strays.index_put((index,), self.doubtful(estimate, index, start, past, expected))
+        found, size = estimate.at(index), (past.first.shape[2], past.first.shape[3])
+        part = (past.since[index] > 1) & of_a_part(self.reference.select(index), found, size)
+        lost = strays.index_put((index,), part | self.doubtful(estimate, index, start, past, expected))
         return disproved(estimate, lost, Reason.AMBIGUOUS)
 
     def own(self, found: Estimate, before: Estimate, start: Tensor, past: Past) -> Estimate:
