@@ -15,6 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Reason, Status
+from torch_ecc.io.cameras.precedence import before_others
 from torch_ecc.io.frames import Frame
 from torch_ecc.io.summary import plain
 
@@ -49,12 +50,13 @@ class Latency:
 
 @contextmanager
 def as_it_comes() -> Iterator[None]:
-    """While frames do not wait, until Ctrl-C: how else would a camera end. What libraries have made is not looked
-    through for garbage, 0.1 s in which nothing else is done."""
+    """While frames do not wait, until Ctrl-C: how else would a camera end. They go before all else, and what libraries
+    have made is not looked through for garbage, 0.1 s in which nothing else is done."""
     gc.collect()
     gc.freeze()
     try:
-        yield
+        with before_others():
+            yield
     except KeyboardInterrupt:
         pass
     finally:

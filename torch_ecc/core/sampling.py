@@ -6,7 +6,7 @@ pixel centres at integers, and a warp is a 2x3 matrix that takes homogeneous tem
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
 from itertools import cycle
 from typing import NamedTuple
@@ -103,6 +103,7 @@ SAMPLERS = {
     ),  # 0.27^7 and 0.43^10: the inverse filters' decay
     "bspline5": Kernel(_quintic, _quintic_slopes, (66 / 120, 26 / 120, 1 / 120), 10, 0.8427, aliases=False),
 }
+BAND, REACH = 160, 16  # px: slopes are made of so many at once; what is farther off counts for less than 1e-9
 SLOPE = (0.0, 1 / 2)  # of the cubic B-spline at 0 and 1 px, but for the sign
 
 
@@ -309,7 +310,15 @@ def _slope_matrix(n: int, device: torch.device) -> Tensor:
 def gradients(image: Tensor) -> Tensor:
     """d/dx and d/dy at the pixels, (B, 1, H, W) -> (B, 2, H, W): the slope of the interpolating cubic B-spline."""
     rows, columns = (_slope_matrix(n, image.device) for n in image.shape[-2:])
-    return torch.cat((image @ columns.mT, rows @ image), 1)
+    along_x = [image[..., near] @ columns[some, near].mT for some, near in _bands(image.shape[-1])]
+    along_y = [rows[some, near] @ image[..., near, :] for some, near in _bands(image.shape[-2])]
+    return torch.cat((torch.cat(along_x, -1), torch.cat(along_y, -2)), 1)
+
+
+def _bands(n: int) -> Iterator[tuple[slice, slice]]:
+    """The pixels of an axis by bands, and those that are near enough to count for their slopes."""
+    for first in range(0, n, BAND):
+        yield slice(first, first + BAND), slice(max(first - REACH, 0), first + BAND + REACH)
 
 
 def aliasing(image: Tensor, interpolation: str) -> Tensor:
@@ -378,8 +387,11 @@ def clipped(image: Tensor) -> Tensor:
     levels = image.new_tensor(FULL_SCALES)
     top = image.amax((2, 3), keepdim=True)
     bright = (image == top) & (top[..., None] == levels).any(-1)
-    extreme = F.pad((image <= 0) | bright, (1, 1, 1, 1), value=True).to(image.dtype)
-    return F.avg_pool2d(extreme, 3, 1) == 1
+    extreme = F.pad((image <= 0) | bright, (1, 1, 1, 1), value=True)
+    for dim in (-1, -2):
+        before, here, after = (extreme.narrow(dim, k, extreme.shape[dim] - 2) for k in range(3))
+        extreme = before & here & after
+    return extreme
 
 
 def noise_level(image: Tensor, kept: Tensor) -> Tensor:
@@ -396,5 +408,4 @@ def noise_level(image: Tensor, kept: Tensor) -> Tensor:
 def noise_samples(image: Tensor) -> Tensor:
     """What the inner pixels of (B, 1, H, W) say of its noise, whose standard deviation is the median of them: all but
     the border, (B, 1, H - 2, W - 2)."""
-    kernel = image.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])[None, None]
-    return F.conv2d(image, kernel).abs() / (6 * 0.6745)
+    return image.diff(n=2, dim=-1).diff(n=2, dim=-2).abs() / (6 * 0.6745)

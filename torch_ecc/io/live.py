@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import atexit
+import time
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from types import MappingProxyType
 from typing import Final
 
-from torch_ecc.io.cameras.newest import Camera, Newest
+from torch_ecc.io.cameras.newest import WAIT_S, Camera, Newest
 from torch_ecc.io.frames import Arrival, FrameError, Medium, Raw
 
 KINDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
@@ -67,6 +68,8 @@ def medium_of(camera: Camera, name: str, fps: float | None = None) -> Medium:
 
     def read(numbers: range) -> Iterator[Raw]:
         first, number = camera.grab(), -1
+        if first is not None and time.perf_counter() - first.time_s > WAIT_S:  # one of before
+            first = camera.grab()
         shot = None if first is None else first._replace(lost=0)
         while shot is not None and first is not None:
             number = shot.number - first.number

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from torch_ecc.io.cameras.precedence import before_others
 from torch_ecc.io.frames import Pixels
 
 WAITING, WAIT_S = 8, 0.1  # pictures that wait at most, and how long
@@ -85,6 +86,10 @@ class Newest:
             self._thread.join(timeout=5)
 
     def _go_on(self) -> None:
+        with before_others():
+            self._read_on()
+
+    def _read_on(self) -> None:
         try:
             while not self._ended and (read := self._read()) is not None:
                 arrived, (pixels, number) = time.perf_counter(), read
