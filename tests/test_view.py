@@ -25,6 +25,7 @@ from torch_ecc.commands.jobs import TrackJob
 from torch_ecc.commands.options import track_command
 from torch_ecc.commands.templates import choose_templates
 from torch_ecc.config import fill
+from torch_ecc.io.frames import Frame
 from torch_ecc.sim.scene.waves import PlaneWaves
 
 pytest.importorskip("starlette", reason="pip install 'torch-ecc[view]'")
@@ -331,3 +332,24 @@ def test_without_the_extra_one_sentence_says_what_to_install(video):
     done = subprocess.run([sys.executable, "-c", code, str(video)], check=False, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr.strip() == "torch-ecc: pick: the page needs starlette: pip install 'torch-ecc[view]'"
+
+
+def test_a_frame_that_is_done_once_more_has_one_row():
+    """A run that goes on may begin with a frame that it had."""
+    frame = PlaneWaves.random(seed=2).render(torch.tensor([[45.0, 40.0, 0.0]]).double(), (80, 90))[0, 0]
+    tracker = te.Tracker(frame, [(45.0, 40.0)], 31)
+    history = History(tracker.start.numpy())
+    for number in (0, 1, 2, 2, 3):
+        history.add(Frame(number, frame), tracker.track(frame))
+    assert history.rows[:, 0].tolist() == [0, 1, 2, 3]
+
+
+def test_numbers_beyond_reason_are_told(data):
+    desk = Desk({"input": str(data / "mechanism_video")})
+    for call, words in (
+        (lambda: desk.grid(10**9, 61), "grid: expected 1 to 163 templates in a row"),
+        (lambda: desk.best(0, 61), "best: expected 1 patch or more, got 0"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()
+    assert "larger than the frame" in desk.predict({"points": [[-1e9, -1e9], [1e9, 0], [0, 1e9]]}).words

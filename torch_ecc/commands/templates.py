@@ -20,6 +20,7 @@ from torch_ecc.search.locate import Located
 from torch_ecc.track.sensor import FIND
 
 LEAST_PRECISE = 0.05  # px: patches of a body that tell less of where they are only take time
+MOST = 20_000  # patches of a grid
 TRIED = 4  # places across, and down, of each field of a grid, for the best patch of a body
 
 
@@ -100,6 +101,8 @@ def choose_templates(job: TrackJob, frame: Tensor) -> Templates:
     for number, polygon in enumerate(polygons):
         if len(polygon) < 3 or not np.isfinite(polygon).all():
             raise ValueError(f"polygons: polygon {number} needs three or more finite corners, got {polygon.tolist()}")
+        if (np.ptp(polygon, 0) > frame.shape[:-3:-1]).any():
+            raise ValueError(f"polygons: polygon {number} is larger than the frame, got {polygon.tolist()}")
     middles = [tuple(np.round((p.min(0) + p.max(0)) / 2)) for p in polygons]
     centers = np.array(job.centers or middles, dtype=np.float64)
     size = job.size
@@ -125,9 +128,10 @@ def grid_templates(job: TrackJob, frame: Tensor) -> Templates:
         raise ValueError("size: expected the side of the templates in px, got none")
     h, w = (job.size, job.size) if isinstance(job.size, int) else job.size
     height, width = frame.shape[-2:]
-    if job.grid is None or job.grid < 1 or h > height or w > width:
+    most = math.isqrt(MOST * width // height)
+    if job.grid is None or not 1 <= job.grid <= most or h > height or w > width:
         raise ValueError(
-            f"grid: expected 1 or more templates in a row, {w}x{h} px each, within {width}x{height} px, got {job.grid}"
+            f"grid: expected 1 to {most} templates in a row, {w}x{h} px each, in {width}x{height} px, got {job.grid}"
         )
     rows = max(round(job.grid * height / width), 1)
     # In the middles of equal fields, but for the templates' own halves at the border.

@@ -41,8 +41,8 @@ def open_frames(
     of the numbers in their names; a TIFF with one time axis; an .npy stack, (F, H, W) or with 1, 3 or 4 channels, first
     or last; an .npz with such an array named ``frames`` or alone; anything indexed like such an array (numpy, dask,
     zarr, h5py); a camera: ``camera:KIND:WHICH`` (see ``live.KINDS``), an index of OpenCV's, as a number or in digits
-    ("0"), or any object with ``grab`` (see ``cameras.newest.Camera``). Frames are read when they are asked for; of a
-    camera each is the newest one, and those in between are lost.
+    ("0"), or any object with ``grab`` (see ``cameras.newest.Camera``). Frames are read when they are asked for; a
+    camera does not wait, and what is lost is counted (see ``cameras.newest``).
 
     ``fps`` in Hz: the frames' times, instead of the source's own. ``channel``, ``slice``, ``position``, from 0: which
     of them to read where a source has several; they are never taken for time. Raises FileNotFoundError where nothing

@@ -222,6 +222,8 @@ class Desk:
 
     def best(self, count: int, size: int) -> None:
         """Up to ``count`` patches of ``size`` px that do not overlap, where they can be tracked best."""
+        if count < 1:
+            raise ValueError(f"best: expected 1 patch or more, got {count}")
         places = self.map(size).best(count)
         if not len(places):
             raise ValueError(f"best: no patch of {size} px has enough texture to fix x, y and theta")

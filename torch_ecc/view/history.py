@@ -66,6 +66,8 @@ class History:
         found[:, 8], found[:, 9] = (code.cpu() for code in codes)
         found[found[:, 8] > Status.MAX_ITERATIONS, :6] = np.nan
         time_s = np.nan if frame.time_s is None else frame.time_s
+        while self._count and self._rows[self._count - 1, 0] >= frame.number:  # a run that goes on does it once more
+            self._count -= 1
         if self._count == len(self._rows):
             self._rows = np.concatenate((self._rows, np.empty_like(self._rows)))
         self._rows[self._count] = (frame.number, time_s, *found.ravel())

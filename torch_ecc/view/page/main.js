@@ -152,6 +152,7 @@ function renderMarks() {
   table.hidden = state.marks.length === 0;
   $("#patches .empty").hidden = state.marks.length > 0;
   $("#clear").hidden = state.marks.length < 2;
+  $("#count").textContent = state.marks.length > 1 ? state.marks.length : "";
   for (const step of ["undo", "redo"]) $(`#${step}`).disabled = running() || !state[step];
   $("tbody", table).replaceChildren(...state.marks.map(row));
   if (state.marks.length > 8 && !table.parentElement.classList.contains("scroll")) {
