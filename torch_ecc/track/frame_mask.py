@@ -18,9 +18,10 @@ from torch import Tensor
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Status, Track
 from torch_ecc.core.frame import as_gray
+from torch_ecc.core.noise import noise_level
 from torch_ecc.core.patches import Size, as_size
 from torch_ecc.core.pose import inverse, matrix
-from torch_ecc.core.sampling import Sampler, inside, noise_level
+from torch_ecc.core.sampling import Sampler, inside
 
 MOST = 48  # frames that are compared, evenly spread over the track
 FEWEST = 5  # frames that tell of a pixel

@@ -23,11 +23,12 @@ from torch import Tensor
 from torch_ecc.core.align import solve_again
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.noise import noise_level
 from torch_ecc.core.normal import LEAST
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference, each, reweigh
 from torch_ecc.core.robust import LEAST_NOISE, Memory, unusual
-from torch_ecc.core.sampling import Sampler, inside, noise_level
+from torch_ecc.core.sampling import Sampler, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import eroded, picked, seen_through
 from torch_ecc.core.verdict import expected_score, within_margin
