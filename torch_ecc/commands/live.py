@@ -52,7 +52,6 @@ class Latency:
 def as_it_comes() -> Iterator[None]:
     """While frames do not wait, until Ctrl-C: how else would a camera end. They go before all else, and what libraries
     have made is not looked through for garbage, 0.1 s in which nothing else is done."""
-    gc.collect()
     gc.freeze()
     try:
         with before_others():

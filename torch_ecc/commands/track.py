@@ -124,8 +124,6 @@ class Session:
         if job.bodies is not None and len(centers) < 2:
             raise ValueError(f"bodies: expected two templates or more, got {len(centers)}")
         self.settings, self.first = settings_of(job, first), first
-        if self.source.live:
-            self.tracker(first)  # the first frame takes longer than all others, and a camera does not wait
 
     def remarks(self) -> list[str]:
         """What people should know before: what was taken from the file, and what is strange about it."""
@@ -151,6 +149,8 @@ class Session:
         KeyboardInterrupt from one of them, ends the run and keeps what it had; so does an error, which is raised again
         once everything before it is written.
         """
+        if self.source.live:
+            self.tracker(self.first)  # a thread's first frame takes longer than all others, and a camera does not wait
         with claim(self.folder):
             films = [film for film in (self._overlay(), self._stabilised()) if film is not None]
             left = self._left(films)

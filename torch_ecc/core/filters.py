@@ -1,12 +1,10 @@
-"""Filters of images: a border continued, Gaussian blur and pyramid, and what their finest texture tells of noise."""
+"""Filters of images: a border continued, Gaussian blur, and the pyramid."""
 
 from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-
-FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65535.0)  # grey levels at which cameras clip
 
 
 def pad(image: Tensor, margin: int) -> Tensor:
@@ -42,32 +40,3 @@ def blur(image: Tensor, sigma: float) -> Tensor:
 def downsample(image: Tensor) -> Tensor:
     """Next pyramid level of (B, 1, H, W): blurred, and pixel (i, j) of it lies exactly at (2 i, 2 j) of ``image``."""
     return blur(image, 1.0)[:, :, ::2, ::2]
-
-
-def clipped(image: Tensor) -> Tensor:
-    """Which pixels (B, 1, H, W) are as dark as can be, or as bright, and all their neighbours too."""
-    levels = image.new_tensor(FULL_SCALES)
-    top = image.amax((2, 3), keepdim=True)
-    bright = (image == top) & (top[..., None] == levels).any(-1)
-    extreme = F.pad((image <= 0) | bright, (1, 1, 1, 1), value=True)
-    for dim in (-1, -2):
-        before, here, after = (extreme.narrow(dim, k, extreme.shape[dim] - 2) for k in range(3))
-        extreme = before & here & after
-    return extreme
-
-
-def noise_level(image: Tensor, kept: Tensor) -> Tensor:
-    """Upper estimate of the white noise of (B, 1, H, W) where ``kept`` > 0, grey levels, (B,).
-
-    Median response to the difference of two Laplacians (Immerkaer, 1996), which cancels flat areas, ramps and edges
-    along rows or columns; what fine texture leaves in it counts as noise. Where the image is clipped there is none.
-    """
-    kept = kept * ~clipped(image)
-    response = torch.where(kept[:, :, 1:-1, 1:-1] > 0, noise_samples(image), float("nan"))
-    return response.flatten(1).nanmedian(-1).values.nan_to_num()
-
-
-def noise_samples(image: Tensor) -> Tensor:
-    """What the inner pixels of (B, 1, H, W) say of its noise, whose standard deviation is the median of them: all but
-    the border, (B, 1, H - 2, W - 2)."""
-    return image.diff(n=2, dim=-1).diff(n=2, dim=-2).abs() / (6 * 0.6745)

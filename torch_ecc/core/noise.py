@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.criteria import centred
-from torch_ecc.core.filters import blur, noise_level, pad
+from torch_ecc.core.filters import blur, pad
 from torch_ecc.core.pose import pose_dtype
 from torch_ecc.core.sampling import gradients
 
@@ -24,6 +25,7 @@ NOISE_RESPONSE = {
     4.0: (0.000621317, 0.000155421),
 }
 LEAST_NOISE = 1e-3  # of the template's contrast: texture weaker than that fixes nothing, however clean the image
+FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65535.0)  # grey levels at which cameras clip
 
 
 class Noise(NamedTuple):
@@ -110,3 +112,32 @@ def largest_eigenvalue(matrix: Tensor) -> Tensor:
     power = torch.linalg.matrix_power(matrix / scale, 16).diagonal(dim1=-2, dim2=-1).sum(-1)
     largest: Tensor = power.clamp(min=0).pow(1 / 16) * scale[:, 0, 0]
     return largest
+
+
+def clipped(image: Tensor) -> Tensor:
+    """Which pixels (B, 1, H, W) are as dark as can be, or as bright, and all their neighbours too."""
+    levels = image.new_tensor(FULL_SCALES)
+    top = image.amax((2, 3), keepdim=True)
+    bright = (image == top) & (top[..., None] == levels).any(-1)
+    extreme = F.pad((image <= 0) | bright, (1, 1, 1, 1), value=True)
+    for dim in (-1, -2):
+        before, here, after = (extreme.narrow(dim, k, extreme.shape[dim] - 2) for k in range(3))
+        extreme = before & here & after
+    return extreme
+
+
+def noise_level(image: Tensor, kept: Tensor) -> Tensor:
+    """Upper estimate of the white noise of (B, 1, H, W) where ``kept`` > 0, grey levels, (B,).
+
+    Median response to the difference of two Laplacians (Immerkaer, 1996), which cancels flat areas, ramps and edges
+    along rows or columns; what fine texture leaves in it counts as noise. Where the image is clipped there is none.
+    """
+    kept = kept * ~clipped(image)
+    response = torch.where(kept[:, :, 1:-1, 1:-1] > 0, noise_samples(image), float("nan"))
+    return response.flatten(1).nanmedian(-1).values.nan_to_num()
+
+
+def noise_samples(image: Tensor) -> Tensor:
+    """What the inner pixels of (B, 1, H, W) say of its noise, whose standard deviation is the median of them: all but
+    the border, (B, 1, H - 2, W - 2)."""
+    return image.diff(n=2, dim=-1).diff(n=2, dim=-2).abs() / (6 * 0.6745)

@@ -16,10 +16,19 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.ambient import plain, threads_for
-from torch_ecc.core.filters import clipped, noise_samples, pad
+from torch_ecc.core.filters import pad
 from torch_ecc.core.frame import as_gray, require_tensor
 from torch_ecc.core.grid import Grid, Place
-from torch_ecc.core.noise import DIM_BLURS, INSTRUMENT_BLUR, LEAST_NOISE, NOISE_SHARE, Noise, blurred
+from torch_ecc.core.noise import (
+    DIM_BLURS,
+    INSTRUMENT_BLUR,
+    LEAST_NOISE,
+    NOISE_SHARE,
+    Noise,
+    blurred,
+    clipped,
+    noise_samples,
+)
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.patches import QUANTISATION, Size, as_size
 from torch_ecc.core.reference import MARGIN, NARROW, Reference, chosen, each

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torch_ecc.core.ambient import plain
 from torch_ecc.core.estimate import Status, Track
-from torch_ecc.core.filters import noise_level
 from torch_ecc.core.frame import as_gray
+from torch_ecc.core.noise import noise_level
 from torch_ecc.core.patches import Size, as_size
 from torch_ecc.core.pose import inverse, matrix
 from torch_ecc.core.sampling import Sampler, inside

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch_ecc.core.align import solve_again
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Status
-from torch_ecc.core.filters import noise_level
+from torch_ecc.core.noise import noise_level
 from torch_ecc.core.normal import LEAST
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference, each, reweigh

@@ -245,6 +245,7 @@ function renderProgress() {
   $("#stop").hidden = !running();
   if (!running()) Object.assign($("#stop"), { disabled: false, textContent: "Stop" });
   $("#resume").hidden = running() || state.there !== "unfinished";
+  $("#track").className = $("#resume").hidden ? "main" : ""; // what is likely to be meant
   const bar = $("#progress");
   bar.hidden = !running();
   if (run?.total) Object.assign(bar, { max: run.total, value: run.done });
