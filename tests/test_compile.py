@@ -14,6 +14,7 @@ from torch import Tensor, nn
 import torch_ecc as te
 from torch_ecc.core.sampling import prefilter
 
+TRACED = pytest.mark.skipif(torch.__version__ < (2, 13), reason="older versions trace less")
 FEW = {"max_iterations": 2, "backend": "torch"}  # tracing takes its time
 
 
@@ -35,6 +36,7 @@ def assert_same(came, wanted: te.Estimate) -> None:
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6 if a is came[0] else 1e-5, equal_nan=True)
 
 
+@TRACED
 def test_align_is_one_graph(blindly):
     """Robust as it is by default."""
     templates, images, start = problem(0)
@@ -59,6 +61,7 @@ class Step(nn.Module):
         return estimate.pose, estimate.status
 
 
+@TRACED
 def test_a_step_is_exported(blindly):
     """With fixed sizes."""
     templates, images, start = problem(0)
@@ -78,6 +81,7 @@ def test_the_prefilter_is_an_operator():
     assert torch.equal(torch.ops.torch_ecc.prefilter(image, "bspline5", 2), prefilter(image, "bspline5", 2))
 
 
+@TRACED
 def test_iterations_are_a_loop(blindly):
     """However many there are: the graph is as long."""
     templates, images, start = problem(0)

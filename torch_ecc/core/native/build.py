@@ -71,7 +71,7 @@ ZIG_X86 = {
     "AVX512": ["-mcpu=x86_64+avx2+fma+avx512f+avx512vl+avx512bw+avx512dq+evex512", "-mprefer-vector-width=512"],
 }
 ARM: Mapping[str, list[str]] = {"baseline": []}  # NEON
-ELF = ["-fPIC", "-pthread", "-Xlinker", f"--version-script={SOURCES / 'exports.map'}", "-Wl,-s"]
+ELF = ["-fPIC", "-pthread", "-Xlinker", "--version-script", "-Xlinker", str(SOURCES / "exports.map"), "-Wl,-s"]
 TARGETS = {  # of wheels, built by zig; Linux as old as manylinux2014
     "linux-x86_64": Target(ZIG_X86, ELF, ".so", "x86_64-linux-gnu.2.17", "manylinux_2_17_x86_64"),
     "linux-aarch64": Target(ARM, ELF, ".so", "aarch64-linux-gnu.2.17", "manylinux_2_17_aarch64"),
@@ -197,7 +197,7 @@ def main() -> None:
     try:
         for library in build(LIBRARIES, here()):
             print(library)
-    except BuildError as failure:
+    except (BuildError, OSError) as failure:  # such as a folder that may not be written to
         sys.exit(f"torch_ecc: {failure}")
 
 

@@ -32,7 +32,7 @@ class EngineHook(BuildHookInterface):
         try:
             target = TARGETS[name] if name else here()
             libraries = build(LIBRARIES if version == "editable" else Path(self.scratch.name), target)
-        except BuildError as failure:
+        except (BuildError, OSError) as failure:  # OSError: where it was to be put
             if name:
                 raise
             self.app.display_warning(f"torch_ecc: without its compiled engine, the slower torch page serves: {failure}")
