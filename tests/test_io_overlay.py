@@ -30,7 +30,7 @@ def found_at(*poses: tuple[float, float, float], status: tuple[int, ...] = ()) -
     codes = torch.tensor(status or (0,) * count, dtype=torch.int8)
     score = torch.full((count,), 0.987)
     covariance = torch.eye(3).expand(count, 3, 3)
-    return Report(pose, pose - pose[0], score, codes, torch.full((count,), 4), covariance, score, score, codes)
+    return Report(pose, pose - pose[0], score, codes, torch.full((count,), 4), covariance, score, score, codes, codes)
 
 
 def drawn(folder: Path, frame: Tensor, *records: Report, shapes=((121, 161),)) -> np.ndarray:

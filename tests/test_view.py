@@ -243,7 +243,7 @@ def test_what_does_not_fit_changes_nothing(video):
         (lambda: desk.set({"fps": -1}), "expected a rate > 0 in Hz, got -1"),
         (lambda: desk.set({"um_per_px": 0}), "finite numbers other than 0, got 0"),
         (lambda: desk.set({"device": "cuda"}), "expected some of frames, fps"),
-        (lambda: desk.grid(2, 300), "300x300 px each, within 160x120 px"),
+        (lambda: desk.grid(2, 300), "300x300 px each, in 160x120 px"),
         (lambda: desk.mark([{"x": "left", "y": 0, "w": 9, "h": 9}]), "centers"),
         (lambda: desk.outline("nothing"), "outline"),
         (lambda: desk.rois("nothing.roi", "?"), "nothing.roi is no region"),

@@ -96,9 +96,8 @@ class Kernel(NamedTuple):
 
 SAMPLERS = {
     "bilinear": Kernel(_linear, _linear_slopes, noise_gain=4 / 9),
-    "bspline3": Kernel(
-        _cubic, _cubic_slopes, (4 / 6, 1 / 6), 7, 0.7643
-    ),  # 0.27^7 and 0.43^10: the inverse filters' decay
+    # 0.27^7 and 0.43^10: the inverse filters' decay
+    "bspline3": Kernel(_cubic, _cubic_slopes, (4 / 6, 1 / 6), 7, 0.7643),
     "bspline5": Kernel(_quintic, _quintic_slopes, (66 / 120, 26 / 120, 1 / 120), 10, 0.8427, aliases=False),
 }
 BAND, REACH = 160, 16  # px: slopes are made of so many at once; what is farther off counts for less than 1e-9
