@@ -74,7 +74,10 @@ def test_a_track_says_how_far_each_template_moved_and_what_was_lost():
     assert second.split() == ["1", "0/5", "5", "LOST"]
 
 
-@pytest.mark.parametrize("record", [estimate(), track()])
+OLD = pytest.mark.skipif(torch.__version__ < (2, 7), reason="torch maps over named tuples, but not over their heirs")
+
+
+@pytest.mark.parametrize("record", [estimate(), pytest.param(track(), marks=OLD)])
 def test_what_is_printed_belongs_to_records_only(record):
     """Maps over records put other things in the place of tensors; copies and pickles are what they were."""
     assert repr(tree_map(lambda value: tuple(value.shape), record)).startswith("((")
