@@ -213,7 +213,7 @@ def test_the_files_and_the_last_lines_say_why(video, tmp_path):
     options = ["--center", "104", "100", "--size", "101", "--um-per-px", "0.5", "--no-overlay", "--out", str(out)]
     done = CliRunner().invoke(app, ["track", str(video), *options])
     assert done.exit_code == 0, done.output
-    assert "Template 0 was not found in 2 of 10 frames. Last frame: Nothing speaks against the pose." in done.output
+    assert "Template 0 was not found in 2 of 10 frames. It is there in the last one." in done.output
     assert "3 of 10 rows are not to be trusted: 2 flat, 1 damaged" in done.output
     table = rows(out)
     assert [row["reason"] for row in table] == ["", "", "", "", "", "FLAT", "FLAT", "", "DAMAGED", ""]

@@ -77,11 +77,9 @@ class Finished(NamedTuple):
             most = ", ".join(f"{number} in {lost[number]}" for number in worst)
             of = f"{len(lost)} of {len(self.lost)} templates were not found in some of {self.frames} frames"
             return [f"{of}, most often {most}: track.csv says why"]
-        return [
-            f"Template {number} was not found in {frames} of {self.frames} frames. "
-            f"Last frame: {Reason.describe(int(self.last_reason[number]))}"
-            for number, frames in lost.items()
-        ]
+        there = "It is there in the last one."
+        ends = [f"Last frame: {Reason.describe(int(code))}" if code else there for code in self.last_reason]
+        return [f"Template {k} was not found in {n} of {self.frames} frames. {ends[k]}" for k, n in lost.items()]
 
 
 class Session:
