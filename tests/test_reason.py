@@ -88,6 +88,8 @@ def test_whatever_takes_the_contrast_is_told_as_that(reason, backend):
     }[reason]
     tracker = Tracker(camera(seen(), 0), [MIDDLE], SIZE, backend=backend)
     assert tracker(camera(change(seen()), 1)).reason == reason
+    if reason == Reason.CLIPPED:  # and not by something even, as bright as no camera clips
+        assert tracker(torch.full_like(camera(seen(), 0), 230)).reason == Reason.FLAT
 
 
 @backends

@@ -482,7 +482,7 @@ def test_of_a_part_is_what_less_than_half_of_a_template_says():
     found = tracker(frames[0])
     for x, coverage, part in ((-8.0, 1.0, True), (8.0, 1.0, False), (20.0, 0.6, True), (100.0, 0.6, False)):
         there = found._replace(pose=torch.tensor([[x, 120.0, 0.0]]).double(), coverage=torch.tensor([coverage]))
-        assert of_a_part(tracker.references[0], there, FRAME) == part
+        assert of_a_part(tracker.references[0], there, frames[0]) == part
     for x, tracked in ((8.0, True), (-8.0, False)):
         tracker = Tracker(frames[0], [(away, 120.0)], 101)
         tracker.expect(torch.tensor([[x, 120.0, 0.0]]), torch.zeros(1, 3), torch.tensor([True]))

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Reason, Status
+from torch_ecc.core.noise import FULL_SCALES
 
 DARK = 0.3  # of the first frame's level and contrast: less is dark
-CLIPPED = 0.3  # of the pixels at the highest level of all
-ROUNDED = 0.01  # of a frame's standard deviation: as the first one is kept
+CLIPPED = 0.3  # of the pixels at a level at which cameras clip
 MAY_BE = (Reason.UNLIKE, Reason.COVERED, Reason.FLAT)  # which may be because of the light
 
 
@@ -30,7 +30,7 @@ def told_of_light(estimate: Estimate, image: Tensor, state: Mapping[str, Tensor]
         before = before * deviation + mean  # it is kept off these
         if now.mean() < DARK * before.mean() and now.std() < DARK * before.std():
             reason[r] = int(Reason.DARK)
-        elif now.max() >= before.max() - ROUNDED * deviation and (now == now.max()).float().mean() > CLIPPED:
+        elif float(now.max()) in FULL_SCALES and (now == now.max()).float().mean() > CLIPPED:
             reason[r] = int(Reason.CLIPPED)
     return estimate._replace(reason=reason)
 

@@ -108,16 +108,21 @@ def from_rest(reference: Reference, image: Tensor, estimate: Estimate, past: Pas
     part = reference.select(index)
     memory = Memory.none(part)._replace(score=past.usual[index])
     found, _ = solve_again(part, view, past.pose[index], settings, past.home[index], memory)
-    good = Status.good(found.status) & ~of_a_part(part, found, (image.shape[2], image.shape[3]))
+    good = Status.good(found.status) & ~of_a_part(part, found, image)
     return estimate.put(index[good], found.at(good))
 
 
-def of_a_part(reference: Reference, found: Estimate, size: tuple[int, int]) -> Tensor:
-    """Which templates (n,) were ``found`` in a frame of ``size`` by less than half of them, beyond its border or not
-    believed: something else may look like that part."""
-    shown = inside(reference.warps(found.pose.detach()), reference.grid.pixels, size)
-    part: Tensor = found.coverage * (reference.weight * shown).sum(1) < LEAST_COVERAGE * reference.weight.sum(1)
-    return part
+def share_in_sight(reference: Reference, pose: Tensor, frame: Tensor) -> Tensor:
+    """What share (n,) of the templates' weight lies in a ``frame`` (..., H, W) at poses (n, 3)."""
+    shown = inside(reference.warps(pose), reference.grid.pixels, (frame.shape[-2], frame.shape[-1]))
+    share: Tensor = (reference.weight * shown).sum(1) / reference.weight.sum(1)
+    return share
+
+
+def of_a_part(reference: Reference, found: Estimate, frame: Tensor) -> Tensor:
+    """Which templates (n,) were ``found`` in a ``frame`` (..., H, W) by less than half of them, beyond its border or
+    not believed: something else may look like that part."""
+    return found.coverage * share_in_sight(reference, found.pose.detach(), frame) < LEAST_COVERAGE
 
 
 def disproved(estimate: Estimate, lost: Tensor, reason: Reason) -> Estimate:
@@ -151,13 +156,6 @@ def strained(reference: Reference, found: Estimate) -> Tensor:
     usual, here = ((value * reference.place.lever).norm(dim=1) for value in (sigma, found.sigma))
     much: Tensor = here > (STRAINED * usual).clamp(min=STRAIN)
     return much
-
-
-def in_sight(reference: Reference, pose: Tensor, image: Tensor) -> Tensor:
-    """At which poses (n, 3) the one template of a ``reference`` lies in the ``image`` (1, 1, H, W) as a whole."""
-    seen = inside(reference.warps(pose), reference.grid.pixels, (image.shape[-2], image.shape[-1]))
-    whole: Tensor = (reference.weight * seen).sum(1) >= WHOLE * reference.weight.sum(1)
-    return whole
 
 
 def beats(found: Estimate, hand: Estimate) -> Tensor:
@@ -262,7 +260,8 @@ class Recovery:
         index = torch.tensor([r], device=pose.device)
         found, _ = locator.candidates(views, 0, pose, allowed=self.allowed(past, index))
         possible = ~self.max_step.exceeded(found.pose, pose, past.since[r])
-        found, best = found.at(possible), found.at(possible & in_sight(locator.pyramids[0][0], found.pose, views[0]))
+        whole = share_in_sight(locator.pyramids[0][0], found.pose, images[0]) >= WHOLE
+        found, best = found.at(possible), found.at(possible & whole)
         best = best.at(index.new_zeros(1)) if len(best.pose) else estimate.at(index)
         known = familiar(best, past.usual[index]) & ~strained(locator.pyramids[0][0], best)
         if not (known & beats(best, estimate.at(index))):
@@ -289,8 +288,7 @@ class Recovery:
         if len(index) == 0:
             return estimate
         expected = ~strayed(estimate, start, past, radius, BASIN)[index]
-        found, size = estimate.at(index), (past.first.shape[2], past.first.shape[3])
-        part = (past.since[index] > 1) & of_a_part(self.reference.select(index), found, size)
+        part = (past.since[index] > 1) & of_a_part(self.reference.select(index), estimate.at(index), past.first)
         lost = strays.index_put((index,), part | self.doubtful(estimate, index, start, past, expected))
         return disproved(estimate, lost, Reason.AMBIGUOUS)
 
