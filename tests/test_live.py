@@ -281,7 +281,6 @@ def core():
 
     core = open_core("demo")
     core.stopSequenceAcquisition()
-    core.setProperty(core.getCameraDevice(), "Mode", "Fluorescent Beads")
     core.setExposure(5)
     return core
 

@@ -28,6 +28,9 @@ def open_core(which: str) -> Any:
         core.loadSystemConfiguration(str(_demo(core) if which == "demo" else Path(which).expanduser()))
     except (RuntimeError, OSError) as error:
         raise ValueError(f"open_frames: Micro-Manager cannot load {which!r} ({error})") from error
+    camera = core.getCameraDevice()
+    if which == "demo" and core.hasProperty(camera, "Mode"):
+        core.setProperty(camera, "Mode", "Fluorescent Beads")  # which move with the stage
     return core
 
 
