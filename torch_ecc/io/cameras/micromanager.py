@@ -28,6 +28,8 @@ def open_core(which: str) -> Any:
         core.loadSystemConfiguration(str(_demo(core) if which == "demo" else Path(which).expanduser()))
     except (RuntimeError, OSError) as error:
         raise ValueError(f"open_frames: Micro-Manager cannot load {which!r} ({error})") from error
+    # Nobody listens to the core's events, and one that comes while the process ends aborts it.
+    super(CMMCorePlus, core).registerCallback(None)
     camera = core.getCameraDevice()
     if which == "demo" and core.hasProperty(camera, "Mode"):
         core.setProperty(camera, "Mode", "Fluorescent Beads")  # which move with the stage
