@@ -153,7 +153,7 @@ def archive(count: int, frames: int) -> None:
 
 
 @app.command()
-@click.option("--count", default=8, help="Recordings for each number of workers.")
+@click.option("--count", default=40, help="Recordings for each number of workers.")
 @click.option("--frames", default=1000)
 @click.option("--rounds", default=5, help="Of a recording as a worker does it.")
 def speed(count: int, frames: int, rounds: int) -> None:
