@@ -317,6 +317,21 @@ def test_a_high_pedestal_changes_nothing(pedestal, illumination):
     assert (raised.pose - plain.pose).abs().max() < 1e-3
 
 
+MODES = {"gain": [], "linear": ["u", "v"], "quadratic": ["u", "v", "u * u", "v * v", "u * v"]}
+
+
+@pytest.mark.parametrize(("illumination", "mode"), [(name, mode) for name, modes in MODES.items() for mode in modes])
+def test_each_mode_of_light_is_fitted(illumination, mode):
+    """A gain that varies as the name says, along each axis, moves no pose and leaves no residual."""
+    frame = SCENE.render(PATH[:1], FRAME)[0, 0]
+    (x, y), size = CENTERS[0], 61
+    v, u = torch.meshgrid(torch.arange(FRAME[0]) - y, torch.arange(FRAME[1]) - x, indexing="ij")
+    shade = 1 + 0.3 * eval(mode, {"u": u / (size / 2), "v": v / (size / 2)})
+    estimate = Tracker(frame, CENTERS[:1], size, illumination=illumination)(frame * shade)
+    assert estimate.displacement.abs().max() < 1e-3
+    assert estimate.residual_rms < 0.05
+
+
 @pytest.mark.parametrize("shape", [(8, 64), (7, 200), (100, 5), (5, 100)])
 def test_frames_of_few_rows_or_columns(shape):
     frame = 255 * torch.rand(shape, generator=torch.Generator().manual_seed(0))
