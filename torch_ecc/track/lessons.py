@@ -2,7 +2,8 @@
 
 A template that follows its surface must not drift off it. Every new one is the mean of frames placed by the last one,
 and is then put where the means before it have it, some of all ages, the first one among them for as long as it is like
-the last one at all (``track.ages``): nothing adds up but what the surface itself has lost.
+the last one at all (``track.ages``): nothing adds up but what the surface itself has lost. Means are kept as they were
+seen, with how far they are off: rounding of 1e-7 px each time that they are put right would add up, too.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from torch_ecc.track.surface import Surface, news, pixels, with_contrast
 HIGH = 0.75  # coverage: with less a frame teaches nothing
 SHARE = 0.5  # of a round's frames must have shown a pixel: else it stays what it was
 AGES = 7  # older means that are kept
-CHANGED = 0.02  # correlation: so much less alike to the first mean than to the last one, it is no more the same
 UNLIKE = 0.2  # correlation: the first mean tells nothing of a template less like it
 PASSES = 2  # in which means are placed among each other
 AT_ONCE = 4  # templates that are renewed together
@@ -49,10 +49,10 @@ class Lessons(NamedTuple):
     ``rounds`` (R,) there have been; the template's ``noise`` (R,) at first, and of how many ``frames`` (R,) it is the
     mean now; of the first round the sums of poses from the start (R, 3, 3): of p, p times the number of the frame, and
     p^2, the ``moves``, and what they leave of one frame's scatter in where the template lies, the ``share`` (R,); means
-    of all ages, the ``older`` (R, AGES, h, w), of which so many are ``held`` (R,), the oldest first; covariances
-    (R, 3, 3), in the template's axes, of the place of that one, ``oldest``, the template's own, ``place``, and what
-    renewals have corrected, ``lag``; and by how much (R, 3) what is new in a round is expected to drag poses along, the
-    ``lead`` that the template is given over that.
+    of all ages, the ``older`` (R, AGES, h, w), off by ``places`` (R, AGES, 3), of which so many are ``held`` (R,), the
+    oldest first; covariances (R, 3, 3), in the template's axes, of the place of that one, ``oldest``, the template's
+    own, ``place``, and what renewals have corrected, ``lag``; and by how much (R, 3) what is new in a round is expected
+    to drag poses along, the ``lead`` that the template is given over that.
     """
 
     fresh: Tensor
@@ -64,6 +64,7 @@ class Lessons(NamedTuple):
     moves: Tensor
     share: Tensor
     older: Tensor
+    places: Tensor
     held: Tensor
     oldest: Tensor
     place: Tensor
@@ -77,10 +78,10 @@ class Lessons(NamedTuple):
         none, one, place = torch.zeros_like(template), torch.ones_like(pose[:, 0]), pose.new_zeros(len(pose), 3, 3)
         images = none, torch.ones_like(template)
         counts = one.long(), torch.zeros_like(one).long()
-        moves, *places = (place.clone() for _ in range(4))
+        moves, *trusted = (place.clone() for _ in range(4))
         more = noise.clone(), one.clone(), moves, one.clone()
-        ages = template.repeat(1, AGES, 1, 1), torch.zeros_like(one).long()
-        values = *images, *counts, *more, *ages, *places, torch.zeros_like(pose)
+        ages = template.repeat(1, AGES, 1, 1), pose.new_zeros(len(pose), AGES, 3), torch.zeros_like(one).long()
+        values = *images, *counts, *more, *ages, *trusted, torch.zeros_like(pose)
         return dict(zip(LESSONS, values, strict=True))
 
 
@@ -205,34 +206,30 @@ class Teacher:
         first = lessons.rounds[which] == 0
         offset, share = at_first(lessons.moves[which], lessons.learned[which], sigma)
         lessons.share[which] = torch.where(first, share, lessons.share[which])
-        mean = shifted(mean, self.interpolation, torch.where(first[:, None], offset, 0.0), crop.centre[which])
-        new = torch.where(enough, mean, old)
+        new, off = torch.where(enough, mean, old), torch.where(first[:, None], offset, 0.0)
         if self.rounds[1] > 0:
-            placed = self.among_older(which, new, enough, crop, lessons)
-            new = torch.where(enough, shifted(placed, self.interpolation, lessons.lead[which], crop.centre[which]), old)
-        crop.template[which] = new
+            seen = Crop(new, crop.mask[which] * enough, crop.centre[which])
+            off = self.among_older(which, seen, off, lessons) + lessons.lead[which]
+        crop.template[which] = torch.where(enough, shifted(new, self.interpolation, off, crop.centre[which]), old)
         lessons.frames[which] = lessons.learned[which].to(lessons.frames)
         lessons.rounds[which] += 1
         for counted in (lessons.fresh, lessons.times, lessons.learned):
             counted[which] = 0
 
-    def among_older(self, which: Tensor, new: Tensor, enough: Tensor, crop: Crop, lessons: Lessons) -> Tensor:
-        """The ``new`` means (n, 1, h, w) of the templates at ``which`` (n,) put where the older ones have them, and
-        these where all of them have each other."""
-        images, step = torch.cat((lessons.older[which], new), 1), torch.zeros_like(lessons.lag[which, 0])
-        noise, there = lessons.noise[which].square() / lessons.learned[which], present(lessons.held[which])
-        counted, centre = crop.mask[which] * enough, crop.centre[which]
-        alike, needed = list[Tensor](), there
+    def among_older(self, which: Tensor, seen: Crop, off: Tensor, lessons: Lessons) -> Tensor:
+        """By how much (n, 3) the means ``seen`` of the templates at ``which`` (n,) are off as the older ones have them,
+        from ``off`` (n, 3) on; and these, as all of them have each other."""
+        images, places = torch.cat((lessons.older[which], seen.template), 1), lessons.places[which]
+        places, there = torch.cat((places, off[:, None]), 1), present(lessons.held[which])
+        noise = lessons.noise[which].square() / lessons.learned[which]
+        about = seen.centre.repeat_interleave(AGES + 1, 0)
         for _ in range(PASSES):
-            found = placed(images, needed, noise, counted, centre)
-            off, about = found.step.nan_to_num(0.0, 0.0, 0.0), centre.repeat_interleave(AGES + 1, 0)
-            each = shifted(images.flatten(0, 1)[:, None], self.interpolation, off.flatten(0, 1), about)
-            images, step = each.view_as(images), step + off[:, -1]
-            alike.append(found.alike)
-            needed = telling(there, alike[0])
-        trust(which, step, found.covariance[:, -1], lessons)
-        remember(which, images, there, found._replace(alike=alike[0]), lessons)
-        return images[:, -1:]
+            right = shifted(images.flatten(0, 1)[:, None], self.interpolation, places.flatten(0, 1), about)
+            found = placed(right.view_as(images), there, noise, seen.mask, seen.centre)
+            places = places + found.step.nan_to_num(0.0, 0.0, 0.0)
+        trust(which, places[:, -1] - off, found.covariance[:, -1], lessons)
+        remember(which, images, places, there, found, lessons)
+        return places[:, -1]
 
 
 def trust(which: Tensor, step: Tensor, covariance: Tensor, lessons: Lessons) -> None:
@@ -254,18 +251,10 @@ def present(held: Tensor) -> Tensor:
     return torch.nn.functional.pad(older, (0, 1), value=True)
 
 
-def telling(there: Tensor, alike: Tensor) -> Tensor:
-    """Which of the means that are ``there`` (n, AGES + 1) bool tell where the last one lies: all of them, or, where it
-    is as ``alike`` (n, AGES + 1, AGES + 1) to the first one as to that before it, the first one alone. Then nothing has
-    changed, and their own noise would only add up."""
-    before = alike[:, -1].gather(1, (there.sum(1, keepdim=True) - 2).clamp(min=0))
-    number = torch.arange(AGES + 1, device=there.device)
-    return there & ((alike[:, -1, :1] < before - CHANGED) | (number == 0) | (number == AGES))
-
-
-def remember(which: Tensor, images: Tensor, there: Tensor, found: Places, lessons: Lessons) -> None:
-    """Of the ``images`` (n, AGES + 1, h, w) that are ``there``, (n, AGES + 1) bool, all are kept but the first one,
-    once it is not alike to the last one any more; and, of too many, that whose neighbours are most alike."""
+def remember(which: Tensor, images: Tensor, places: Tensor, there: Tensor, found: Places, lessons: Lessons) -> None:
+    """Of the ``images`` (n, AGES + 1, h, w), off by ``places`` (n, AGES + 1, 3), that are ``there`` (n, AGES + 1), all
+    are kept but the first one, once it is not alike to the last one any more; and, of too many, that whose
+    neighbours are most alike."""
     number = torch.arange(AGES + 1, device=there.device)
     gone = found.alike[:, 0, -1] < UNLIKE
     least = found.alike.diagonal(offset=2, dim1=1, dim2=2).argmax(1, keepdim=True) + 1
@@ -274,6 +263,7 @@ def remember(which: Tensor, images: Tensor, there: Tensor, found: Places, lesson
     order = (number + len(number) * ~stay).argsort(1)[:, :AGES]
     moved = lessons.oldest[which] + found.covariance.gather(1, order[:, :1, None, None].expand(-1, -1, 3, 3))[:, 0]
     lessons.oldest[which] = torch.where(moved.isfinite(), moved, lessons.oldest[which])
+    lessons.places[which] = places.gather(1, order[:, :, None].expand(-1, -1, 3))
     lessons.older[which] = images.gather(1, order[:, :, None, None].expand(-1, -1, *images.shape[2:]))
     lessons.held[which] = stay.sum(1)
 
