@@ -10,7 +10,11 @@ from engines import BACKENDS, compiled
 from torch import Tensor
 
 from torch_ecc import Status, Tracker, align, prepare
-from torch_ecc.core.robust import quantile, trust, weighted_median
+from torch_ecc.core.align import engine_for
+from torch_ecc.core.covariance import hidden
+from torch_ecc.core.robust import quantile, solve, trust, weighted_median
+from torch_ecc.core.settings import Settings
+from torch_ecc.core.solution import Trust
 from torch_ecc.sim.scene.micrograph import micrograph
 from torch_ecc.sim.scene.pads import Pads
 from torch_ecc.sim.scene.speckle import Speckle
@@ -140,6 +144,23 @@ def test_what_was_hidden_is_found_again_behind_what_is_left_of_the_cover():
     assert (track.status[:2, 0] == Status.LOST).all()
     assert track.status[2, 0] == Status.CONVERGED
     assert (track.pose[2, 0] - poses[3])[:2].abs().max() < 0.05
+
+
+def test_sigma_knows_what_a_cover_does_to_the_blocks_beside_it():
+    """It ends within them, or the sampler carries its edge there: against the same blocks of the same frame without it,
+    of a corner of a pad, which one block fixes or not, behind the same cover a pixel farther and farther."""
+    poses = torch.tensor([[160.0, 120.0, 0.0], [145.9, 105.9, -0.15]], dtype=torch.float64)
+    first, clean = noisy(Pads.wafer(seed=1).render(poses, (240, 320))[:, 0].float()).float()[:, None, None]
+    reference, start, settings, ratios = prepare(first[..., 90:151, 130:191]), poses[1:], Settings(), []
+    for left in range(152, 162):
+        view = clean.clone()
+        view[..., left : left + 6] = 10
+        beside = solve(engine_for(reference, view, settings), reference, view, start, settings)
+        same = Trust(torch.arange(1), beside.trust)
+        clear = engine_for(reference, clean, settings)(reference, clean, start, settings, same)
+        unsure = hidden(reference, beside, start.new_tensor([2.0**2 * 2]))
+        ratios.append((beside.pose - clear.pose)[0] / unsure[0].diagonal().sqrt())
+    assert 0.5 < torch.stack(ratios).square().mean().sqrt() < 1.5
 
 
 @scenes

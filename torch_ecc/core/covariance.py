@@ -9,10 +9,14 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from torch_ecc.core.noise import Noise
 from torch_ecc.core.normal import Normal
 from torch_ecc.core.reference import Reference
+from torch_ecc.core.solution import Solution
+
+UNNOTICED = 2.0  # times what is expected of a block it may hold beside that and still be believed, see ``robust``
 
 
 class Sandwich(NamedTuple):
@@ -70,6 +74,23 @@ def pose_covariance(
     half = cofactors * root
     rest = known.place if coherent is None else torch.addcmul(known.place, known.alias, coherent.square())
     return torch.baddbmm(rest, torch.bmm(half.mT, meat), half)
+
+
+def hidden(reference: Reference, found: Solution, white: Tensor) -> Tensor | None:
+    """What blocks that are believed next to others that are not may hide, as far as nobody notices: a covariance
+    (B, 3, 3) of poses in frames with noise that counts as ``white`` (B,), variance over squared gain. None if it is
+    known that all are believed.
+
+    A cover ends where it likes, and the sampler carries its edge into blocks that it does not reach.
+    """
+    if found.trust is None:
+        return None
+    doubted = (found.trust < 1).to(found.trust).unflatten(1, reference.grid.blocks)
+    near = max_pool2d(doubted[:, None], 3, 1, 1).flatten(1) * found.trust
+    rows = found.normal.inverse[:, :3]
+    meat = torch.einsum("bpqn,bn->bpq", reference.parts.normal, near.to(reference.parts.normal)).to(rows)
+    spread = rows @ meat @ rows.mT
+    return UNNOTICED / 2 * white.view(-1, 1, 1) * (spread + spread.mT)
 
 
 def coherence(axes: Tensor, sides: Tensor) -> Tensor:

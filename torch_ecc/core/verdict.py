@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_ecc.core.ambient import constant, lasting
 from torch_ecc.core.clinging import clinging, scale_of
-from torch_ecc.core.covariance import Sandwich, coherence, largest_variance, pose_covariance, sandwich
+from torch_ecc.core.covariance import Sandwich, coherence, hidden, largest_variance, pose_covariance, sandwich
 from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.core.noise import NOISE_SHARE
@@ -111,14 +111,15 @@ def judge(
     scatter, strained = clinging(reference, found, white, constant.clusters)
     coherent = None if settings.interpolation not in reference.noise.alias else coherence(axes, reference.grid.sides)
     covariance = pose_covariance(constant.sandwich, variance, power, bias, scatter, coherent)
+    unnoticed = hidden(reference, found, variance / power)
     unobservable = largest_variance(reference.place.lever2, covariance), constant.share * bias
     visible, believed = seen_and_believed(reference, found)
     share, on_cpu = normal.noise_share * variance, is_cpu(pose.device)
     if push is not None and normal is reference.normal and not (on_cpu and max(share.tolist()) <= LEAST_SHARE):
         share = push.unanswered(share)
     amounts = visible, score, found.gain, believed, *unobservable, found.error, share
-    if strained is not None:  # which is no lack of texture
-        covariance = covariance + strained
+    for more in (strained, unnoticed):  # which are no lack of texture
+        covariance = covariance if more is None else covariance + more
     covariance = torch.bmm(torch.bmm(axes, covariance), axes.mT)
     tracked, status, reason = (codes.clone() for codes in _zeros(len(pose), pose.device))
     rms = (error / normal.total).sqrt()
