@@ -23,7 +23,10 @@ def main() -> None:
     gc.enable()
     for number in heeded:
         signal.signal(number, signal.default_int_handler)
-    command_line()
+    try:
+        command_line()
+    finally:
+        gc.freeze()  # nor is what is there at the end
 
 
 if __name__ == "__main__":

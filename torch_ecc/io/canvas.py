@@ -117,13 +117,13 @@ class Canvas:
     def label(self, spot: Box, text: str, colour: Colour) -> None:
         """``text`` on dark ground with an edge of ``colour``, at a ``spot`` of the canvas as large as ``measure``."""
         ground = self.image[spot.y : spot.y + spot.h, spot.x : spot.x + spot.w]
-        ground[:] = _DARK
+        cv2.rectangle(self.image, spot, _DARK, cv2.FILLED)
+        cv2.rectangle(self.image, spot._replace(w=self.gap), colour, cv2.FILLED)
         for number, line in enumerate(text.split("\n")):
             ink = np.hstack([_glyph(self._size, letter, colour) for letter in line or " "])
             top = self.gap + number * (_height(self._size) + self.gap)
             under = ground[top : top + ink.shape[0], 3 * self.gap : 3 * self.gap + ink.shape[1]]
             under[:] = ink[: under.shape[0], : under.shape[1]]
-        ground[:, : self.gap] = colour
 
 
 @cache

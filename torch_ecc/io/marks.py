@@ -17,6 +17,7 @@ _TRAIL: Colour = (255, 215, 90)
 _CROWD = 30  # templates: of more, those that are right are outlines alone,
 _ROOM = 8.0  # unless they are so many times as large as their number
 _Side: TypeAlias = Literal["above", "below", "right", "left", "tag"]
+_Spot: TypeAlias = tuple[_Side, Box]
 
 
 class Mark(NamedTuple):
@@ -55,8 +56,10 @@ class Mark(NamedTuple):
 
     def plain(self, canvas: Canvas, count: int) -> bool:
         """Whether one of so many templates is to be an outline alone: where nothing is wrong, in a crowd."""
+        if count <= _CROWD or self.word != CONVERGED:
+            return False
         box, (w, h) = self.box(canvas), canvas.measure(str(self.number))
-        return count > _CROWD and self.word == CONVERGED and box.w * box.h < _ROOM * w * h
+        return box.w * box.h < _ROOM * w * h
 
     def text(self, side: _Side) -> str:
         """The words of the label: all of them, or only the number (and LOST) for a tag."""
@@ -103,27 +106,35 @@ class Labels:
 
     def draw(self, canvas: Canvas, marks: Sequence[Mark]) -> None:
         """The labels of the same templates as in the frames before."""
-        sides = self._place(canvas, marks, self._sides or ["above"] * len(marks))
-        if not self._sides and 2 * sides.count("tag") > len(marks):
-            sides = ["tag"] * len(marks)
-        self._sides = sides
-        for mark, side in zip(marks, sides, strict=True):
+        boxes = [mark.box(canvas) for mark in marks]
+        spots = self._place(canvas, marks, boxes)
+        if not self._sides and 2 * spots.count(None) > len(marks):
+            spots = [None] * len(marks)
+        self._sides = ["tag" if spot is None else spot[0] for spot in spots]
+        for mark, box, spot in zip(marks, boxes, spots, strict=True):
             if mark.plain(canvas, len(marks)):
                 continue
-            text = mark.text(side)
-            box, size = mark.box(canvas), canvas.measure(text)
-            spot = Box(box.x, box.y - size[1], *size) if side == "tag" else _spots(canvas, box, size)[side]
-            canvas.label(canvas.clamp(spot), text, mark.colour)
+            if spot is not None:
+                canvas.label(spot[1], mark.text(spot[0]), mark.colour)
+                continue
+            text = mark.text("tag")
+            w, h = canvas.measure(text)
+            canvas.label(canvas.clamp(Box(box.x, box.y - h, w, h)), text, mark.colour)
 
-    def _place(self, canvas: Canvas, marks: Sequence[Mark], before: Sequence[_Side]) -> list[_Side]:
-        boxes = [mark.box(canvas) for mark in marks]
-        labels, sides = [self._reserved], list[_Side]()
-        for index, (mark, side) in enumerate(zip(marks, before, strict=True)):
-            spots = _spots(canvas, boxes[index], canvas.measure(mark.text("above")))
-            sides.append("tag" if side == "tag" else _choose(spots, side, labels, boxes))
-            if sides[-1] != "tag":
-                labels.append(spots[sides[-1]])
-        return sides
+    def _place(self, canvas: Canvas, marks: Sequence[Mark], boxes: Sequence[Box]) -> list[_Spot | None]:
+        """The side and place of each label; None for a tag."""
+        labels, found = [self._reserved], list[_Spot | None]()
+        sides: list[_Side] = self._sides or ["above"] * len(marks)
+        for mark, box, before in zip(marks, boxes, sides, strict=True):
+            if before == "tag":
+                found.append(None)
+                continue
+            spots = _spots(canvas, box, canvas.measure(mark.text("above")))
+            side = _choose(spots, before, labels, boxes)
+            found.append(None if side == "tag" else (side, spots[side]))
+            if side != "tag":
+                labels.append(spots[side])
+        return found
 
 
 def _choose(spots: Mapping[_Side, Box], before: _Side, labels: Sequence[Box], templates: Sequence[Box]) -> _Side:
