@@ -111,6 +111,7 @@ class Journal:
     def __post_init__(self) -> None:
         self._dtype, self._table = self.form.dtype, self.form.table
         self.fields = [name for name in self._dtype.names or () if name != "state"]
+        self._of_record = [name for name in self.fields if name not in {"frame", "time_s"}]
 
     @staticmethod
     def begin(folder: Path, form: Form, settings: Mapping[str, Any]) -> Journal:
@@ -141,12 +142,10 @@ class Journal:
         self, arrays: Mapping[str, NDArray[Any]], said: tuple[list[str], ...], frame: Frame, state: bytes
     ) -> None:
         """One frame more, with what is ``said`` of it in words. ValueError if it is not like the first one."""
+        if (count := len(arrays["pose"])) != self.form.templates:
+            raise ValueError(f"write: record must have {self.form.templates} templates as before, got {count}")
         row = np.zeros((), self._dtype)
-        for name in set(self.fields) - {"frame", "time_s"}:
-            if arrays[name].shape != row[name].shape:
-                raise ValueError(
-                    f"write: record must have {len(row[name])} templates as before, got {len(arrays[name])}"
-                )
+        for name in self._of_record:
             row[name] = arrays[name]
         row["frame"] = frame.number
         if self.form.timed:
