@@ -157,7 +157,7 @@ def gradients(
     by_g, *by_look = pulled(place.sums, (values[:, 0].requires_grad_(), *template), by_sums)
     by_place = torch.zeros_like(found.pose) if by_pose is None else by_pose
     if by_g is not None:
-        by_place = by_place + (values[:, 1:] @ by_g[:, :, None])[:, :, 0].to(by_place.dtype)
+        by_place = by_place + (by_g[:, None] @ values[:, 1:].mT)[:, 0].to(by_place.dtype)
     by_step = only(solved, -(by_place[:, None] @ inverse)[:, 0], torch.zeros_like(by_place)).to(values.dtype)
     by_both = zip(by_look, condition.by_template(by_step), strict=True)
     by_template = [added(solved, *both) for both in (*by_both, *((v,) for v in by_normal))]
