@@ -68,6 +68,63 @@ void lines(const View& view, const Warp& there, Body body) {
   }
 }
 
+struct Places {  // of a vector of points, each with taps of its own
+  int32_t at[LANES];
+};
+
+// `runs` of any line: the body has `Places` where neighbours do not have neighbouring taps.
+template <int degree, class Body>
+void vectors(const Window& window, const Line& line, Body body) {
+  if (straight(line)) return runs<degree>(window, line, body);
+  constexpr float BELOW_ONE = 0.99999f;
+  const float right = float(window.w - degree - 1) + BELOW_ONE, bottom = float(window.h - degree - 1) + BELOW_ONE;
+  Vector lane;
+  for (int k = 0; k < LANES; ++k) lane[k] = float(k);
+  for (int i = 0; i < line.n; i += LANES, lane += float(LANES)) {
+    Places places;
+    Vector fx, fy;
+    for (int k = 0; k < LANES; ++k) {
+      const float x = std::clamp(line.x + float(i + k) * line.dx, 0.f, right);
+      const float y = std::clamp(line.y + float(i + k) * line.dy, 0.f, bottom);
+      const int32_t ix = int32_t(x), iy = int32_t(y);
+      fx[k] = x - float(ix), fy[k] = y - float(iy);
+      places.at[k] = iy * int32_t(window.pitch()) + ix;
+    }
+    body(places, i, line.n - i, fx, fy, lane);
+  }
+}
+
+inline Vector tap(const float* values, int64_t at) { return load<Vector>(values + at); }
+
+inline Vector tap(const float* values, const Places& places) {
+  float taps[LANES];
+  for (int k = 0; k < LANES; ++k) taps[k] = values[places.at[k]];
+  return load<Vector>(taps);
+}
+
+// Adds the products of wx and wy to the taps.
+template <int degree>
+void add(float* values, int64_t pitch, int64_t at, int, const Vector (&wx)[degree + 1], const Vector (&wy)[degree + 1]) {
+  for (int k = 0; k <= degree; ++k) {
+    float* const to = values + at + k * pitch;
+    Vector near = load<Vector>(to), beyond = load<Vector>(to + LANES);
+    [&]<int... l>(std::integer_sequence<int, l...>) {  // the l-th tap is l values farther on
+      ((near += after<LANES - l>(Vector{}, wy[k] * wx[l])), ...);
+      ((beyond += after<LANES - l>(wy[k] * wx[l], Vector{})), ...);
+    }(std::make_integer_sequence<int, degree + 1>());
+    store(near, to);
+    store(beyond, to + LANES);
+  }
+}
+
+template <int degree>
+void add(float* values, int64_t pitch, const Places& places, int n, const Vector (&wx)[degree + 1],
+         const Vector (&wy)[degree + 1]) {
+  for (int i = 0; i < n; ++i)
+    for (int k = 0; k <= degree; ++k)
+      for (int l = 0; l <= degree; ++l) values[places.at[i] + k * pitch + l] += wy[k][i] * wx[l][i];
+}
+
 // values, (4, N) of patch b.
 template <int degree>
 void linearise(const View& view, int64_t b) {
@@ -84,8 +141,8 @@ void linearise(const View& view, int64_t b) {
     // from the pose: of the line's first pixel
     const float x = float(warp.x(view.u[first], view.v[first]) - view.pose[3 * b]);
     const float y = float(warp.y(view.u[first], view.v[first]) - view.pose[3 * b + 1]);
-    runs<degree>(window, line, [&](int64_t at, int i, int left, const Vector& fx, const Vector& fy, const Vector& lane) {
-      Vector wx[taps], wy[taps], dx[taps], dy[taps], value[4]{};
+    vectors<degree>(window, line, [&](auto at, int i, int left, const Vector& fx, const Vector& fy, const Vector& lane) {
+      Vector wx[taps], wy[taps], dx[taps], dy[taps], sum[4]{};
       weigh<degree, Vector>(fx, wx);
       weigh<degree, Vector>(fy, wy);
       weigh_slopes<degree, Vector>(fx, dx);
@@ -93,17 +150,17 @@ void linearise(const View& view, int64_t b) {
       for (int k = 0; k < taps; ++k) {
         Vector row{}, along{};
         for (int l = 0; l < taps; ++l) {
-          const Vector tap = load<Vector>(window.values.data() + at + k * window.pitch() + l);
-          row += wx[l] * tap;
-          along += dx[l] * tap;
+          const Vector value = tap(window.values.data() + k * window.pitch() + l, at);
+          row += wx[l] * value;
+          along += dx[l] * value;
         }
-        value[0] += wy[k] * row;
-        value[1] += wy[k] * along;
-        value[2] += dy[k] * row;
+        sum[0] += wy[k] * row;
+        sum[1] += wy[k] * along;
+        sum[2] += dy[k] * row;
       }
-      value[3] = value[1] * (y + line.dy * lane) - value[2] * (x + line.dx * lane);  // eq. (2): d(x, y) / dtheta = (y, -x)
+      sum[3] = sum[1] * (y + line.dy * lane) - sum[2] * (x + line.dx * lane);  // eq. (2): d(x, y) / dtheta = (y, -x)
       for (int k = 0; k < 4; ++k) {
-        const Vector scaled = value[k] * unit;
+        const Vector scaled = sum[k] * unit;
         std::memcpy(out + k * n + first + i, &scaled, 4 * std::min(left, LANES));
       }
     });
@@ -121,22 +178,14 @@ void spread(const View& view, int64_t b) {
   window.values.assign(window.values.size(), 0);
   const float* const by = view.values + b * view.pixels;
   lines(view, there, [&](int64_t first, const Line& line) {
-    runs<degree>(window, line, [&](int64_t at, int i, int left, const Vector& fx, const Vector& fy, const Vector&) {
+    vectors<degree>(window, line, [&](auto at, int i, int left, const Vector& fx, const Vector& fy, const Vector&) {
       Vector wx[taps], wy[taps], value{};
-      std::memcpy(&value, by + first + i, 4 * std::min(left, LANES));
+      const int n = std::min(left, LANES);
+      std::memcpy(&value, by + first + i, 4 * n);
       weigh<degree, Vector>(fx, wx);
       weigh<degree, Vector>(fy, wy);
       for (int l = 0; l < taps; ++l) wx[l] *= value * unit;
-      for (int k = 0; k < taps; ++k) {
-        float* const to = window.values.data() + at + k * window.pitch();
-        Vector near = load<Vector>(to), beyond = load<Vector>(to + LANES);
-        [&]<int... l>(std::integer_sequence<int, l...>) {  // the l-th tap is l values farther on
-          ((near += after<LANES - l>(Vector{}, wy[k] * wx[l])), ...);
-          ((beyond += after<LANES - l>(wy[k] * wx[l], Vector{})), ...);
-        }(std::make_integer_sequence<int, taps>());
-        store(near, to);
-        store(beyond, to + LANES);
-      }
+      add<degree>(window.values.data(), window.pitch(), at, n, wx, wy);
     });
   });
   empty_window<degree>(window, view.frame.h, view.frame.w, view.image + b * view.next_frame);

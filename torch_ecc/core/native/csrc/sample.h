@@ -148,10 +148,14 @@ void sample_points(const Window& window, const Line& line, float* __restrict out
   }
 }
 
+inline bool straight(const Line& line) {
+  constexpr float STRAIGHT = 0.15f;  // rows crossed per px up to which runs are long enough to pay
+  return line.dx > 0.9f && line.dx <= 1 && std::abs(line.dy) < STRAIGHT;
+}
+
 template <int degree>
 void sample(const Window& window, const Line& line, float* out) {
-  constexpr float STRAIGHT = 0.15f;  // rows crossed per px up to which runs are long enough to pay
-  if (line.dx > 0.9f && line.dx <= 1 && std::abs(line.dy) < STRAIGHT)
+  if (straight(line))
     sample_runs<degree>(window, line, out);
   else
     sample_points<degree>(window, line, out);
