@@ -153,19 +153,19 @@ def gradients(
     condition = condition_of(place.of(template), values, partial(place.increment, values[:, 0]), template)
     inverse, solved = inverse_slope(condition.slope, turn(found.pose[:, 2]))
     solved = solved & there
-    by_pose, *by_sums = (None if v is None else only(solved, v, torch.zeros_like(v)) for v in (by_pose, *by_sums[:3]))
+    by_pose, *by_sums = (None if v is None else only(solved, v, 0.0) for v in (by_pose, *by_sums[:3]))
     by_g, *by_look = pulled(place.sums, (values[:, 0].requires_grad_(), *template), by_sums)
     by_place = torch.zeros_like(found.pose) if by_pose is None else by_pose
     if by_g is not None:
         by_place = by_place + (by_g[:, None] @ values[:, 1:].mT)[:, 0].to(by_place.dtype)
-    by_step = only(solved, -(by_place[:, None] @ inverse)[:, 0], torch.zeros_like(by_place)).to(values.dtype)
+    by_step = only(solved, -(by_place[:, None] @ inverse)[:, 0], 0.0).to(values.dtype)
     by_both = zip(by_look, condition.by_template(by_step), strict=True)
     by_template = [added(solved, *both) for both in (*by_both, *((v,) for v in by_normal))]
     if not image.requires_grad:
         return None, by_template
     by_patch = condition.by_patch(by_step)
     by_g = by_patch if by_g is None else by_g + by_patch
-    return by_image(only(solved, by_g, torch.zeros_like(by_g))), by_template
+    return by_image(only(solved, by_g, 0.0)), by_template
 
 
 def where_there(there: Tensor, values: Tensor, template: Template) -> tuple[Tensor, Template]:
@@ -198,16 +198,16 @@ def inverse_slope(slope: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
     """A^-1 (B, 3, 3) of A the ``slope`` (B, 3, 3) along poses with ``axes`` (B, 3, 3), see ``pose.turn``, 0 where there
     is no solution; and where (B,) there is one."""
     inverse, solved = safe_inverse(slope.to(axes.dtype) @ axes)  # in the template's axes it is about 1
-    return only(solved, axes @ inverse, torch.zeros_like(inverse)), solved
+    return only(solved, axes @ inverse, 0.0), solved
 
 
 def added(some: Tensor, *gradients: Tensor | None) -> Tensor | None:
     """The sum of ``gradients`` of templates (B, ...), 0 but for ``some`` (B,)."""
     there = [gradient for gradient in gradients if gradient is not None]
-    return only(some, sum(there[1:], there[0]), torch.zeros_like(there[0])) if there else None
+    return only(some, sum(there[1:], there[0]), 0.0) if there else None
 
 
-def only(some: Tensor, value: Tensor, other: Tensor) -> Tensor:
+def only(some: Tensor, value: Tensor, other: Tensor | float) -> Tensor:
     """The ``value`` (B, ...) of ``some`` templates (B,), of the rest the ``other``; a value that is not finite there is
     none to the gradient either."""
     return torch.where(some.view(-1, *[1] * (value.dim() - 1)), value, other)
