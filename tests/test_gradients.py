@@ -12,9 +12,12 @@ from torch.utils.checkpoint import checkpoint
 
 import torch_ecc as te
 from torch_ecc.core import columns as prepared
-from torch_ecc.core import solver
+from torch_ecc.core import linearised, solver
 from torch_ecc.core.align import found, solve
+from torch_ecc.core.native import adjoint
+from torch_ecc.core.native.library import load
 from torch_ecc.core.reference import Reference, prepare
+from torch_ecc.core.sampling import inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Trust
 from torch_ecc.core.verdict import judge
@@ -148,6 +151,28 @@ def test_engines_have_the_same_gradients(robust):
         torch.testing.assert_close(native, page, rtol=1e-2, atol=1e-2 * float(page.abs().max()))
 
 
+@pytest.mark.skipif(load() is None, reason="there is no native engine here")
+@pytest.mark.parametrize("interpolation", SAMPLERS)
+def test_the_compiled_way_to_the_image_is_that_of_the_page(interpolation):
+    """Values, slopes and their transpose, in any direction and across borders, of one image or each its own."""
+    more = torch.tensor([[70.3, 60.2, 0.02], [20.2, 20.4, -1.5], [90.4, -3.3, 3.1]], dtype=torch.float64)
+    truth = torch.cat((TRUTH + 0.017, more))  # no pixel lies on one, where bilinear values have a kink
+    (templates, images, _), settings = seen(truth), Settings(interpolation)
+    reference = prepare(templates)
+    in_sight = inside(reference.warps(truth), reference.grid.pixels, FRAME)
+    for frames in images, images[:1]:
+        native = adjoint.look(reference, frames, truth, settings)
+        page = linearised.look(exact(reference), frames.double(), truth, settings)
+        by_g = direction(native.values[:, 0]) * in_sight
+        seen_there = [values * in_sight[:, None] for values in (native.values, page.values)]
+        for came, wanted in seen_there, (native.by_image(by_g), page.by_image(by_g.double())):
+            torch.testing.assert_close(came.double(), wanted, rtol=0, atol=1e-4 * float(wanted.abs().max()))
+    with pytest.raises(ValueError, match="expected by_g, warp"):
+        torch.ops.torch_ecc.spread(by_g, truth[1:], truth, reference.grid.pixels, reference.grid.box, [1, 1, 9, 9], 3)
+    with pytest.raises(ValueError, match="expected size"):
+        adjoint.spread(by_g, reference.warps(truth), truth, reference.grid.pixels, reference.grid.box, [2, 1, 9, 9], 3)
+
+
 @pytest.mark.parametrize(
     "problem",
     [{"texture": "edge"}, {"shown": "other"}, {"shown": "blank", "dtype": torch.float32}, {"place": "outside"}],
@@ -159,11 +184,13 @@ def test_what_was_not_found_takes_the_gradient_to_its_start(problem):
     reference, image, start = problem.made(CRITERIA[1])
     templates = reference.signal[:, 3].reshape(2, 1, *problem.size).clone().requires_grad_()
     image, start = image.float().requires_grad_(), start.requires_grad_()
-    estimate = te.align(prepare(templates), image, start)
-    assert not estimate.ok.any()
-    gradients = torch.autograd.grad(estimate.pose.sum(), (image, templates, start), retain_graph=True)
-    assert [bool(gradient.any()) for gradient in gradients] == [False, False, True]
-    assert torch.equal(gradients[2], torch.ones_like(start))
+    for criterion in CRITERIA[-1], CRITERIA[1]:
+        with torch.autograd.set_detect_anomaly(True):  # which tells of a NaN on the way too
+            estimate = te.align(prepare(templates, criterion=criterion), image, start, min_score=0.9)
+            gradients = torch.autograd.grad(estimate.pose.sum(), (image, templates, start), retain_graph=True)
+        assert not estimate.ok.any()
+        assert [bool(gradient.any()) for gradient in gradients] == [False, False, True]
+        assert torch.equal(gradients[2], torch.ones_like(start))
     others = (estimate.score + estimate.residual_rms).sum() + estimate.covariance.nan_to_num(posinf=0).sum()
     for gradient in torch.autograd.grad(others, (image, templates)):
         assert gradient.isfinite().all()

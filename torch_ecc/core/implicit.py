@@ -28,16 +28,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
-from torch_ecc.core.criteria import ECC, safe_inverse
-from torch_ecc.core.linearised import linearised
+from torch_ecc.core import linearised
+from torch_ecc.core.condition import Gradients, condition_of, pulled
+from torch_ecc.core.criteria import safe_inverse
+from torch_ecc.core.native import adjoint
 from torch_ecc.core.normal import Normal
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference, each, reweigh
-from torch_ecc.core.sampling import inside, is_cpu, make_sampler
+from torch_ecc.core.sampling import inside, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution, counted_pixels, summed
-
-Gradients = Sequence[Tensor | None]
 
 
 def wanted(reference: Reference, image: Tensor, start: Tensor) -> bool:
@@ -57,7 +57,7 @@ def attached(
     seen = reference if counted is None else reweigh(reference, counted)
     in_view = reference.weight if visible is None else reference.weight * visible
     template = Template(seen.K, seen.signal, seen.weight, in_view)
-    place = Place(each(torch.Tensor.detach, seen._replace(coarse=None)), found, trusted, settings.interpolation)
+    place = Place(each(torch.Tensor.detach, seen._replace(coarse=None)), found, trusted, settings)
     of_template = seen.normal if seen.K.requires_grad else ()
     pose, gain, sums, total, *normal = answered(place, image, start, *template, *of_template)
     found = found._replace(pose=pose, gain=gain, sums=sums, total=total)
@@ -79,12 +79,12 @@ class Template(NamedTuple):
 
 class Place(NamedTuple):
     """Where templates were ``found``: the ``reference`` of the pixels that count there, how far their blocks are
-    ``trusted`` (B, blocks), and what samples the image."""
+    ``trusted`` (B, blocks), and by which ``settings``."""
 
     reference: Reference
     found: Solution
     trusted: Tensor | None
-    interpolation: str
+    settings: Settings
 
     def of(self, template: Template) -> Reference:
         """The reference of a ``template``."""
@@ -96,10 +96,10 @@ class Place(NamedTuple):
         given = Template(*template)
         return summed(self.of(given), g, given.seen, self.trusted)
 
-    def increment(self, g: Tensor, *template: Tensor) -> Sequence[Tensor]:
+    def increment(self, g: Tensor, *template: Tensor) -> Tensor:
         """That which the criterion asks for, (B, 3)."""
         reference = self.of(Template(*template))
-        return (reference.criterion.step(reference, g),)
+        return reference.criterion.step(reference, g)
 
 
 class _Context(FunctionCtx):
@@ -145,39 +145,38 @@ def gradients(
     With one look at the patches, and what leads back from them to the image: never one at more than their
     neighbourhoods.
     """
-    reference, pixels = place.reference, place.reference.grid.pixels
-    pose, (by_sums, by_normal) = place.found.pose, (by_sums[:3], by_sums[3:])
-    warp = reference.warps(pose)
-    sample = make_sampler(place.interpolation, image.to(reference.K.dtype), warp, reference.grid.box)
-    seen = linearised(sample, warp, pixels)
-    g, slopes = seen.g, along_pose(seen.slopes, warp, pose, pixels)
-    U = slope_of_step(reference, g)
-    inverse, solved = inverse_slope(U, slopes, turn(pose[:, 2]))
-    by_g, *by_look = pulled(place.sums, (g.requires_grad_(), *template), by_sums)
-    g, by_g = g.detach(), torch.zeros_like(g) if by_g is None else by_g
-    v = (slopes @ by_g[:, :, None])[:, :, 0].to(inverse.dtype)
-    less = -((v if by_pose is None else v + by_pose)[:, None] @ inverse)
-    by_step = pulled(partial(place.increment, g), template, (less[:, 0].to(g.dtype),))
-    by_g = torch.baddbmm(by_g[:, None], less.to(g.dtype), U)[:, 0]
-    by_template = [added(solved, *both) for both in (*zip(by_look, by_step, strict=True), *((v,) for v in by_normal))]
+    found, by_normal = place.found, by_sums[3:]
+    look = adjoint.look if adjoint.takes(place.reference, image, place.settings) else linearised.look
+    values, by_image = look(place.reference, image, found.pose, place.settings)
+    there = (found.gain > 0) & (found.total[:, 2] > 0)
+    values, template = where_there(there, values, Template(*template))
+    condition = condition_of(place.of(template), values, partial(place.increment, values[:, 0]), template)
+    inverse, solved = inverse_slope(condition.slope, turn(found.pose[:, 2]))
+    solved = solved & there
+    by_pose, *by_sums = (None if v is None else only(solved, v, 0.0) for v in (by_pose, *by_sums[:3]))
+    by_g, *by_look = pulled(place.sums, (values[:, 0].requires_grad_(), *template), by_sums)
+    by_place = torch.zeros_like(found.pose) if by_pose is None else by_pose
+    if by_g is not None:
+        by_place = by_place + (by_g[:, None] @ values[:, 1:].mT)[:, 0].to(by_place.dtype)
+    by_step = only(solved, -(by_place[:, None] @ inverse)[:, 0], 0.0).to(values.dtype)
+    by_both = zip(by_look, condition.by_template(by_step), strict=True)
+    by_template = [added(solved, *both) for both in (*by_both, *((v,) for v in by_normal))]
     if not image.requires_grad:
         return None, by_template
-    return seen.by_image(only(solved, by_g, torch.zeros_like(g)), image), by_template
+    by_patch = condition.by_patch(by_step)
+    by_g = by_patch if by_g is None else by_g + by_patch
+    return by_image(only(solved, by_g, 0.0)), by_template
 
 
-def pulled(function: Callable[..., Sequence[Tensor]], at: Sequence[Tensor], by: Gradients) -> list[Tensor | None]:
-    """The gradients by those arguments of a ``function`` that ask for some, ``at`` their values, from those ``by`` what
-    it gives."""
-    leaves = [value.detach().requires_grad_(value.requires_grad) for value in at]
-    asked = [leaf for leaf in leaves if leaf.requires_grad]
-    if not asked or all(value is None for value in by):
-        return [None] * len(at)
-    with torch.enable_grad():
-        values, given = zip(
-            *(pair for pair in zip(function(*leaves), by, strict=True) if pair[1] is not None), strict=True
-        )
-    found = iter(torch.autograd.grad(values, asked, given, allow_unused=True))
-    return [next(found) if leaf.requires_grad else None for leaf in leaves]
+def where_there(there: Tensor, values: Tensor, template: Template) -> tuple[Tensor, Template]:
+    """Patches ``values`` (B, 4, N) and a ``template`` with which all that is derived is finite: as they are of those
+    ``there`` (B,), of others, which have no gradients, the whole template as its own patch."""
+    if is_cpu(there.device) and bool(there.all()):
+        return values, template
+    whole = torch.ones_like(template.weight)
+    own = torch.cat((template.signal[:, 3:], torch.zeros_like(template.signal[:, :3])), 1)
+    weights = (only(there, v, whole).requires_grad_(v.requires_grad) for v in (template.weight, template.seen))
+    return only(there, values, own), Template(template.K, template.signal, *weights)
 
 
 def in_sight(reference: Reference, warp: Tensor, image: Tensor) -> Tensor | None:
@@ -195,41 +194,20 @@ def believed(reference: Reference, found: Solution) -> Tensor | None:
     return clear if found.trust is None else found.trust * clear
 
 
-def along_pose(slopes: Tensor, warp: Tensor, pose: Tensor, pixels: Tensor) -> Tensor:
-    """What the ``slopes`` (B, 2, N) of the image make of the patches in the ``warp`` (B, 2, 3) when x, y and theta of
-    the ``pose`` (B, 3) grow: (B, 3, N)."""
-    offset = torch.cat((warp[:, :, :2], warp[:, :, 2:] - pose[:, :2, None]), 2).to(slopes.dtype) @ pixels
-    (gx, gy), (x, y) = slopes.unbind(1), offset.unbind(1)
-    return torch.stack((gx, gy, gx * y - gy * x), 1)  # eq. (2): d(x, y) / dtheta = (y, -x)
-
-
-def slope_of_step(reference: Reference, g: Tensor) -> Tensor:
-    """U (B, 3, N) at patches ``g`` (B, N): by how much an increment changes with each pixel of the patch."""
-    if type(reference.criterion) is ECC:  # of b / a
-        of_b, of_a = reference.K.narrow(1, 0, 3), reference.K.narrow(1, 3, 1)
-        increment, a = reference.criterion.step(reference, g)[:, :, None], of_a @ (g - g[:, :1])[:, :, None]
-        return torch.baddbmm(of_b, increment, of_a, alpha=-1).div_(a)
-    g = g.detach().requires_grad_()
-    with torch.enable_grad():
-        rows = [row.sum() for row in reference.criterion.step(reference, g).unbind(1)]
-    return torch.stack([torch.autograd.grad(row, g, retain_graph=True)[0] for row in rows], 1)
-
-
-def inverse_slope(U: Tensor, slopes: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """A^-1 (B, 3, 3) of patches with ``slopes`` (B, 3, N) along poses with ``axes`` (B, 3, 3), see ``pose.turn``, 0
-    where there is no solution; and where (B,) there is one."""
-    slope = (U @ slopes.mT).to(axes.dtype) @ axes  # in the template's axes it is about 1
-    inverse, solved = safe_inverse(slope)
-    return only(solved, axes @ inverse, torch.zeros_like(inverse)), solved
+def inverse_slope(slope: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """A^-1 (B, 3, 3) of A the ``slope`` (B, 3, 3) along poses with ``axes`` (B, 3, 3), see ``pose.turn``, 0 where there
+    is no solution; and where (B,) there is one."""
+    inverse, solved = safe_inverse(slope.to(axes.dtype) @ axes)  # in the template's axes it is about 1
+    return only(solved, axes @ inverse, 0.0), solved
 
 
 def added(some: Tensor, *gradients: Tensor | None) -> Tensor | None:
     """The sum of ``gradients`` of templates (B, ...), 0 but for ``some`` (B,)."""
     there = [gradient for gradient in gradients if gradient is not None]
-    return only(some, sum(there[1:], there[0]), torch.zeros_like(there[0])) if there else None
+    return only(some, sum(there[1:], there[0]), 0.0) if there else None
 
 
-def only(some: Tensor, value: Tensor, other: Tensor) -> Tensor:
+def only(some: Tensor, value: Tensor, other: Tensor | float) -> Tensor:
     """The ``value`` (B, ...) of ``some`` templates (B,), of the rest the ``other``; a value that is not finite there is
     none to the gradient either."""
     return torch.where(some.view(-1, *[1] * (value.dim() - 1)), value, other)

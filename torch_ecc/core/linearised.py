@@ -6,13 +6,41 @@ look-up and m = s / X the pair's centre of mass (``Sampler``). Its slope is X' L
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from itertools import cycle, product
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_ecc.core.sampling import Sampler, lookup, prefilter_matrix
+from torch_ecc.core.reference import Reference
+from torch_ecc.core.sampling import Sampler, lookup, make_sampler, prefilter_matrix
+from torch_ecc.core.settings import Settings
+
+
+class Look(NamedTuple):
+    """Patches as they were seen: ``values`` (B, 4, N), what was sampled and what the slopes of the image make of that
+    when x, y and theta of the pose grow; ``by_image``: what leads from gradients by the first of them, (B, N), to that
+    by the image (I, 1, H, W)."""
+
+    values: Tensor
+    by_image: Callable[[Tensor], Tensor]
+
+
+def look(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Look:
+    """At B templates in (B or 1, 1, H, W) at poses (B, 3)."""
+    warp, pixels = reference.warps(pose), reference.grid.pixels
+    sample = make_sampler(settings.interpolation, image.to(reference.K.dtype), warp, reference.grid.box)
+    seen = linearised(sample, warp, pixels)
+    return Look(along_pose(seen, warp, pose, pixels), partial(seen.by_image, size=image.shape))
+
+
+def along_pose(seen: Linearised, warp: Tensor, pose: Tensor, pixels: Tensor) -> Tensor:
+    """``Look.values`` in the ``warp`` (B, 2, 3) of a ``pose`` (B, 3)."""
+    offset = torch.cat((warp[:, :, :2], warp[:, :, 2:] - pose[:, :2, None]), 2).to(seen.g.dtype) @ pixels
+    (gx, gy), (x, y) = seen.slopes.unbind(1), offset.unbind(1)
+    return torch.stack((seen.g, gx, gy, gx * y - gy * x), 1)  # eq. (2): d(x, y) / dtheta = (y, -x)
 
 
 class Linearised(NamedTuple):
@@ -24,17 +52,17 @@ class Linearised(NamedTuple):
     slopes: Tensor
     lookups: list[tuple[Tensor, Tensor]]
 
-    def by_image(self, by_g: Tensor, image: Tensor) -> Tensor:
-        """The gradient by the ``image`` (I, 1, H, W) that ``make_sampler`` has made the sampler of, from that by the
-        patches (B, N): the transposes of sampling, prefilter and crop."""
+    def by_image(self, by_g: Tensor, size: torch.Size) -> Tensor:
+        """The gradient by the image, of ``size`` (I, 1, H, W), that ``make_sampler`` has made the sampler of, from that
+        by the patches (B, N): the transposes of sampling, prefilter and crop."""
         by, kernel = self.by_values(by_g), self.sampler.kernel
         if kernel.ring:
             given = kernel.taps, kernel.ring, by.dtype, by.device
             rows, columns = (prefilter_matrix(n - 2 * kernel.ring, *given) for n in by.shape[-2:])
             by = rows.mT @ by @ columns
-        if by.shape == image.shape:
+        if by.shape == size:
             return by
-        total, (h, w) = by.new_zeros(image.shape), by.shape[-2:]
+        total, (h, w) = by.new_zeros(size), by.shape[-2:]
         corners = (self.sampler.origin + kernel.ring).long().tolist()
         for frame, (x, y), part in zip(cycle(total), corners, by, strict=False):
             frame[:, y : y + h, x : x + w] += part

@@ -42,20 +42,18 @@ def call(
         raise ValueError(
             f"solve: expected start ({count}, 3), image (1 or {count}, 1, H, W), got {start.shape}, {image.shape}"
         )
-    stride, start = image.stride(), start if start.is_contiguous() else start.contiguous()
-    if stride[3] != 1 or image.is_neg():
-        image = image.resolve_neg().contiguous()
-        stride = image.stride()
+    start = start if start.is_contiguous() else start.contiguous()
+    image, next_frame = frames_of(image)
     if trust is None:
         results = [torch.empty_like(result) for result in results]  # the fastest way to a tensor
     else:
         some = _places(trust, results[4])
         results = [result.new_empty((len(trust.which), *result.shape[1:])) for result in results]
     record = CALL.pack(
-        *(image.data_ptr(), image.element_size(), height, width, stride[2], stride[0] if many > 1 else 0),
+        *(image.data_ptr(), image.element_size(), height, width, image.stride(2), next_frame),
         *(start.data_ptr(), *some, _bent(distortion, len(start))),
         *[result.data_ptr() for result in results],
-        *(len(results[0]), _threads(len(results[0]) * packed.pixels), *how),
+        *(len(results[0]), threads_for(len(results[0]) * packed.pixels), *how),
     )
     partial = library.solve(record + packed.memory)
     if partial < 0:
@@ -63,7 +61,14 @@ def call(
     return partial, results
 
 
-def _threads(pixels: int) -> int:
+def frames_of(image: Tensor) -> tuple[Tensor, int]:
+    """Frames (I, 1, H, W) of whole rows, and how many pixels it is from one to the next, 0 if there is one."""
+    if image.stride(3) != 1 or image.is_neg():
+        image = image.resolve_neg().contiguous()
+    return image, image.stride(0) if len(image) > 1 else 0
+
+
+def threads_for(pixels: int) -> int:
     """For so many of templates. They sleep while there is nothing to do; but one that is interrupted in its last
     template has the others wait for a time slice, so that less work is not shared."""
     return 1 if pixels < PIXELS_PER_THREAD else min(1 + pixels // PIXELS_PER_THREAD, threads_of_caller())

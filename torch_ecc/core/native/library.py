@@ -25,10 +25,12 @@ WRITABLE = 0o002  # by anyone
 
 
 class Library(NamedTuple):
-    """The set of ``instructions`` it is made of, and its ``solve``, see csrc/engine.cpp."""
+    """The set of ``instructions`` it is made of, and its entries, see csrc/engine.cpp."""
 
     instructions: str
     solve: Callable[[bytes], int]
+    linearise: Callable[[bytes], int]
+    spread: Callable[[bytes], int]
 
 
 class UnfitError(Exception):
@@ -78,9 +80,11 @@ def _load(kind: str, path: Path) -> Library:
         )
     if path.stem.rpartition("-")[2] != build.digest(path):
         raise UnfitError(f"{path} is damaged or was changed; install again")
-    solve = ctypes.CDLL(str(path)).torch_ecc_solve  # the interpreter goes on with other threads while it runs
-    solve.argtypes, solve.restype = [ctypes.c_char_p], ctypes.c_int64
-    return Library(kind, solve)
+    library = ctypes.CDLL(str(path))  # the interpreter goes on with other threads while it runs
+    entries = [getattr(library, f"torch_ecc_{name}") for name in Library._fields[1:]]
+    for entry in entries:
+        entry.argtypes, entry.restype = [ctypes.c_char_p], ctypes.c_int64
+    return Library(kind, *entries)
 
 
 def constants() -> dict[str, float]:

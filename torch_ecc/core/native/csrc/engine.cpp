@@ -1,5 +1,6 @@
-// torch_ecc_solve, the one entry: the loop of core/solver.py for templates on the CPU, in parallel over them. All that is
-// pointed to has been checked by its only callers, engine.py and operator.py.
+// The entries: torch_ecc_solve, the loop of core/solver.py for templates on the CPU, in parallel over them, and what
+// leads back from poses to the image. All that is pointed to has been checked by their only callers, in Python.
+#include "adjoint.h"
 #include "pool.h"
 #include "solve.h"
 
@@ -88,4 +89,16 @@ EXPORTED int64_t torch_ecc_solve(const ecc::Call* call) {
     if (!ecc::answer(*call, b)) ++partial;
   });
   return done ? partial.load() : -1;
+}
+
+// The values of patches and their slopes; -1 if memory does not suffice.
+EXPORTED int64_t torch_ecc_linearise(const ecc::View* view) {
+  const auto go = view->degree == 1 ? ecc::linearise<1> : view->degree == 3 ? ecc::linearise<3> : ecc::linearise<5>;
+  return ecc::share(view->count, view->threads, [&](int64_t b) { go(*view, b); }) - 1;
+}
+
+// From gradients by these values to one by the image, which more than one thread may only add to if each patch has its own.
+EXPORTED int64_t torch_ecc_spread(const ecc::View* view) {
+  const auto go = view->degree == 1 ? ecc::spread<1> : view->degree == 3 ? ecc::spread<3> : ecc::spread<5>;
+  return ecc::share(view->count, view->threads, [&](int64_t b) { go(*view, b); }) - 1;
 }

@@ -44,39 +44,50 @@ void weigh(Real t, Real (&w)[degree + 1]) {
 }
 
 // Neighbours on a line that turns little have neighbouring taps: up to where the line crosses into the next row or
-// column, every tap of theirs is one vector as it stands in memory. Writes whole vectors, from where the next run
-// or nothing of worth follows.
-template <int degree>
-void sample_runs(const Window& window, const Line& line, float* out) {
-  constexpr int taps = degree + 1;
-  constexpr float unit = 1 / (UNIT[degree] * UNIT[degree]);
+// column, every tap of theirs is one vector as it stands in memory. body(at, i, left, fx, fy, lane) for each vector of
+// points from the i-th on, of which `left` are left in their run: `at` the place of the first tap of the first of them,
+// (fx, fy) how far they lie behind it, `lane` their numbers.
+template <int degree, class Body>
+void runs(const Window& window, const Line& line, Body body) {
   constexpr float BEYOND = 2e-5f;  // px that a run may go beyond: a line along a column of pixels would have no run
-  const int64_t pitch = window.pitch(), right = window.w - taps, bottom = window.h - taps;
-  const float drift = line.dx - 1, across = std::abs(line.dy);
-  const float per_column = -1 / std::min(drift, -1e-9f), per_row = 1 / std::max(across, 1e-9f);
+  const int64_t right = window.w - degree - 1, bottom = window.h - degree - 1;
+  const float drift = line.dx - 1;
+  const float per_column = 1 / std::max(std::abs(drift), 1e-9f), per_row = 1 / std::max(std::abs(line.dy), 1e-9f);
   Vector lane;
   for (int k = 0; k < LANES; ++k) lane[k] = float(k);
   for (int first = 0, last; first < line.n; first = last) {
     const float x = line.x + float(first) * line.dx, y = line.y + float(first) * line.dy;
     const int64_t ix = std::clamp<int64_t>(int64_t(x), 0, right), iy = std::clamp<int64_t>(int64_t(y), 0, bottom);
     const float fx = x - float(ix), fy = y - float(iy);
-    const float room = std::min((fx + BEYOND) * per_column, ((line.dy < 0 ? fy : 1 - fy) + BEYOND) * per_row);
+    const float room = std::min(((drift > 0 ? 1 - fx : fx) + BEYOND) * per_column,
+                                ((line.dy < 0 ? fy : 1 - fy) + BEYOND) * per_row);
     last = first + 1 + int(std::clamp(room, 0.f, float(line.n)));
     last = std::min(last, line.n);
-    const float* from = window.values.data() + iy * pitch + ix;
-    for (int i = first; i < last; i += LANES, from += LANES) {
-      Vector wx[taps], wy[taps], sum{};
+    for (int i = first; i < last; i += LANES) {
       const Vector along = lane + float(i - first);
-      weigh<degree, Vector>(fx + drift * along, wx);
-      weigh<degree, Vector>(fy + line.dy * along, wy);
-      for (int k = 0; k < taps; ++k) {
-        Vector row = wx[0] * load<Vector>(from + k * pitch);
-        for (int l = 1; l < taps; ++l) row += wx[l] * load<Vector>(from + k * pitch + l);
-        sum += wy[k] * row;
-      }
-      store(sum * unit, out + i);
+      body(iy * window.pitch() + ix + i - first, i, last - i, fx + drift * along, fy + line.dy * along, lane + float(i));
     }
   }
+}
+
+// Writes whole vectors, from where the next run or nothing of worth follows.
+template <int degree>
+void sample_runs(const Window& window, const Line& line, float* out) {
+  constexpr int taps = degree + 1;
+  constexpr float unit = 1 / (UNIT[degree] * UNIT[degree]);
+  const int64_t pitch = window.pitch();
+  const float* const values = window.values.data();
+  runs<degree>(window, line, [&](int64_t at, int i, int, const Vector& fx, const Vector& fy, const Vector&) {
+    Vector wx[taps], wy[taps], sum{};
+    weigh<degree, Vector>(fx, wx);
+    weigh<degree, Vector>(fy, wy);
+    for (int k = 0; k < taps; ++k) {
+      Vector row = wx[0] * load<Vector>(values + at + k * pitch);
+      for (int l = 1; l < taps; ++l) row += wx[l] * load<Vector>(values + at + k * pitch + l);
+      sum += wy[k] * row;
+    }
+    store(sum * unit, out + i);
+  });
 }
 
 // Any line, point by point.
@@ -137,10 +148,14 @@ void sample_points(const Window& window, const Line& line, float* __restrict out
   }
 }
 
+inline bool straight(const Line& line) {
+  constexpr float STRAIGHT = 0.15f;  // rows crossed per px up to which runs are long enough to pay
+  return line.dx > 0.9f && line.dx <= 1 && std::abs(line.dy) < STRAIGHT;
+}
+
 template <int degree>
 void sample(const Window& window, const Line& line, float* out) {
-  constexpr float STRAIGHT = 0.15f;  // rows crossed per px up to which runs are long enough to pay
-  if (line.dx > 0.9f && line.dx <= 1 && std::abs(line.dy) < STRAIGHT)
+  if (straight(line))
     sample_runs<degree>(window, line, out);
   else
     sample_points<degree>(window, line, out);

@@ -68,7 +68,10 @@ bool find(const Template& t, const Pixels& p, const Frame& frame, const Warp& wa
   const bool covered = low[0] - first >= double(window.x0) && low[1] - first >= double(window.y0) &&
                        high[0] + last <= double(window.x0 + window.w - 1) &&
                        high[1] + last <= double(window.y0 + window.h - 1);
-  if (anew || !covered) open_window<degree>(frame, low, high, degree == 1 ? 4 : 1, window);
+  if (anew || !covered) {
+    place_window<degree>(low, high, degree == 1 ? 4 : 1, window);
+    fill_window<degree>(frame, window);
+  }
   return true;
 }
 

@@ -177,20 +177,64 @@ struct Prefilter {
       std::copy_n(window.line.data() + start, window.w, window.values.data() + j * window.pitch());
     }
   }
+
+  // The transpose of that up to what is read: filters are even, and what they end with is next to 0.
+  static void spread(Window& window) {
+    const int64_t high = window.h + 2 * start, pitch = padded(window.w + 2 * start);
+    window.raw.assign(pitch * high, 0);
+    window.line.resize(pitch + LANES);
+    float* at = window.raw.data() + start * pitch;
+    for (int64_t j = 0; j < window.h; ++j)
+      std::copy_n(window.values.data() + j * window.pitch(), window.w, at + j * pitch + start);
+    for (int64_t j = 0; j < window.h; ++j, at += pitch) {
+      row(at, pitch, window.line.data());
+      std::copy_n(window.line.data(), pitch, at);
+    }
+    columns(window.raw.data(), high, pitch);
+  }
 };
 
-// Makes `window` hold what a sampler of `degree` needs between (low) and (high), px, with `slack` px around.
+// Puts `window` where a sampler of `degree` needs values between (low) and (high), px, with `slack` px around.
 template <int degree>
-void open_window(const Frame& frame, const double (&low)[2], const double (&high)[2], double slack, Window& window) {
+void place_window(const double (&low)[2], const double (&high)[2], double slack, Window& window) {
   window.x0 = int64_t(std::floor(low[0] - slack)) - degree / 2;
   window.y0 = int64_t(std::floor(low[1] - slack)) - degree / 2;
   window.w = int64_t(std::floor(high[0] + slack)) + (degree + 1) / 2 + 1 - window.x0;
   window.h = int64_t(std::floor(high[1] + slack)) + (degree + 1) / 2 + 1 - window.y0;
   window.values.resize(window.pitch() * window.h + Window::SPARE);
+}
+
+template <int degree>
+void fill_window(const Frame& frame, Window& window) {
   if constexpr (degree == 1) {
     read(frame, window.x0, window.y0, window.w, window.h, window.pitch(), false, window.values.data());
   } else {
     Prefilter<degree>::fill(frame, window);
+  }
+}
+
+// Adds `values`, (h, w) of rows that lie `pitch` apart, to where `read` would have them from in an image (high, wide).
+inline void add_rows(const float* values, int64_t x0, int64_t y0, int64_t w, int64_t h, int64_t pitch, bool mirrored,
+                     int64_t high, int64_t wide, float* image) {
+  const int64_t first = std::clamp<int64_t>(-x0, 0, w), last = std::clamp<int64_t>(wide - x0, first, w);
+  for (int64_t j = 0; j < h; ++j, values += pitch) {
+    float* const row = image + within(y0 + j, high, mirrored) * wide;
+    for (int64_t i = 0; i < first; ++i) row[within(x0 + i, wide, mirrored)] += values[i];
+    for (int64_t i = first; i < last; ++i) row[x0 + i] += values[i];
+    for (int64_t i = last; i < w; ++i) row[within(x0 + i, wide, mirrored)] += values[i];
+  }
+}
+
+// The transpose of `fill_window`: adds what the window's values bring to an image (high, wide).
+template <int degree>
+void empty_window(Window& window, int64_t high, int64_t wide, float* image) {
+  const int64_t x0 = window.x0, y0 = window.y0, w = window.w, h = window.h;
+  if constexpr (degree == 1) {
+    add_rows(window.values.data(), x0, y0, w, h, window.pitch(), false, high, wide, image);
+  } else {
+    const int64_t start = Prefilter<degree>::start, all = h + 2 * start, pitch = padded(w + 2 * start);
+    Prefilter<degree>::spread(window);
+    add_rows(window.raw.data(), x0 - start, y0 - start, w + 2 * start, all, pitch, true, high, wide, image);
   }
 }
 
