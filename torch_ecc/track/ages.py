@@ -30,7 +30,7 @@ from torch_ecc.core.sampling import gradients
 BAND = 8  # frequencies in x and in y of a cell
 SMOOTH = 7  # frequencies in x and y over which a spectrum is averaged
 DARKEST = 1e-4  # of a spectrum's largest value: no frequency counts as if there were less
-EDGE = 25  # px: over so many what counts is averaged, so that it ends softly
+EDGE = 9  # px: over so many what counts is averaged, so that it ends softly
 FAINT = 0.05  # of full weight is what counts at least
 POOR = 0.02  # of the mean power: cells with less tell nothing
 OWN = 1e-4  # of what an image has in a cell no other explains
