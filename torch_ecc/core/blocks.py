@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.criteria import centred
+from torch_ecc.core.grid import BLOCK
 
 if TYPE_CHECKING:
     from torch_ecc.core.reference import Reference
@@ -87,3 +88,17 @@ def parts_of(reference: Reference) -> Parts:
     for k in range(p):
         sums[:, k].index_add_(2, grid.block, both * (Z[:, k] * columns.weight)[:, None])
     return Parts(sums[:, :, :p], sums[:, :, p:], reference.blocks.weight, reference.place.radius)
+
+
+def patch_of(reference: Reference) -> Tensor:
+    """Pixels (B,) that the texture is alike over: the sum of its squared autocorrelation."""
+    grid, used = reference.grid, reference.weight > 0
+    t, _ = centred(reference.signal[:, 3], reference.weight)
+    column, row = (grid.pixels[:2] - grid.box[:2, :1]).round().long()
+    height, width = (2 * BLOCK * n for n in grid.blocks)  # half of it empty: it is not periodic
+    texture = t.new_zeros(len(t), height * width).index_add_(1, row * width + column, t * used)
+    power = torch.fft.rfft2(texture.view(-1, height, width)).abs().square().to(grid.sides)
+    power[..., 1 : width // 2] *= 2**0.5  # which stand for two
+    total = texture.square().sum(1, dtype=power.dtype).square().clamp(min=1e-30)
+    patch: Tensor = power.square().sum((1, 2)) / (height * width) / total
+    return patch

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.ambient import lasting, ordinary
-from torch_ecc.core.blocks import Blocks, Parts, blocks_of, parts_of
+from torch_ecc.core.blocks import Blocks, Parts, blocks_of, parts_of, patch_of
 from torch_ecc.core.columns import Columns, columns_of
 from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.filters import pad
@@ -115,6 +115,11 @@ class Reference(_Groups):
         """What they leave if it is strained: made once, if it is needed."""
         return strains_of(self.parts, self.normal) if torch.compiler.is_compiling() else self._kept_strains
 
+    @property
+    def patch(self) -> Tensor:
+        """Pixels (B,) that their texture is alike over: made once, if it is needed."""
+        return patch_of(self) if torch.compiler.is_compiling() else self._kept_patch
+
     @cached_property
     def verdicts(self) -> dict[str, Known]:
         """What the verdict on them needs, by sampler: see ``verdict.known``."""
@@ -134,6 +139,11 @@ class Reference(_Groups):
     @lasting
     def _kept_strains(self) -> Strains:
         return strains_of(self.parts, self.normal)
+
+    @cached_property
+    @lasting
+    def _kept_patch(self) -> Tensor:
+        return patch_of(self)
 
     @cached_property
     @lasting

@@ -25,6 +25,7 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution
+from torch_ecc.core.unlike import unlike
 
 LEAST_COVERAGE = 0.5  # of the weight in sight must be believed: else what covers the template may be taken for it
 LEAST_INFORMATION = 0.2  # of that of all pixels in sight must be left in what is believed, in x, y and theta each
@@ -111,14 +112,14 @@ def judge(
     scatter, strained = clinging(reference, found, white, constant.clusters)
     coherent = None if settings.interpolation not in reference.noise.alias else coherence(axes, reference.grid.sides)
     covariance = pose_covariance(constant.sandwich, variance, power, bias, scatter, coherent)
-    unnoticed = hidden(reference, found, variance / power)
+    unseen = hidden(reference, found, variance / power), unlike(reference, found, score, scatter)
     unobservable = largest_variance(reference.place.lever2, covariance), constant.share * bias
     visible, believed = seen_and_believed(reference, found)
     share, on_cpu = normal.noise_share * variance, is_cpu(pose.device)
     if push is not None and normal is reference.normal and not (on_cpu and max(share.tolist()) <= LEAST_SHARE):
         share = push.unanswered(share)
     amounts = visible, score, found.gain, believed, *unobservable, found.error, share
-    for more in (strained, unnoticed):  # which are no lack of texture
+    for more in (strained, *unseen):  # which are no lack of texture
         covariance = covariance if more is None else covariance + more
     covariance = torch.bmm(torch.bmm(axes, covariance), axes.mT)
     tracked, status, reason = (codes.clone() for codes in _zeros(len(pose), pose.device))
