@@ -6,9 +6,11 @@ import subprocess
 import sys
 import tracemalloc
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -170,3 +172,13 @@ def test_bad_tracks(tmp_path):
     with pytest.raises(ValueError, match="plot_track: track must have at least one frame and template"):
         plot_track(track(0), tmp_path / "track.png")
     assert not list(Path(tmp_path).iterdir())
+
+
+def test_threads_draw_what_one_draws(tmp_path):
+    """And leave matplotlib's settings as they were."""
+    data, before = track(5, 1), dict(mpl.rcParams)
+    alone = plot_track(data, tmp_path / "alone.png").read_bytes()
+    with ThreadPoolExecutor(3) as pool:
+        drawn = list(pool.map(lambda k: plot_track(data, tmp_path / f"{k}.png").read_bytes(), range(3)))
+    assert drawn == [alone] * 3
+    assert dict(mpl.rcParams) == before

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from threading import RLock
 from typing import Any
 
 import matplotlib as mpl
@@ -27,11 +29,18 @@ COMPONENTS = ("x", "y", r"$\theta$")
 UNITS = ("px", "px", "deg")
 
 
+_ALONE = RLock()
+
+
 @contextmanager
-def styled() -> Iterator[None]:
-    """The context in which a figure is drawn; a decorator too."""
-    with mpl.rc_context(RC):
+def drawn_with(settings: Any) -> Iterator[None]:
+    """The context in which a figure is drawn; a decorator too. Matplotlib's settings are the whole process's: of two
+    threads, one would draw with the other's, and leave them behind."""
+    with _ALONE, mpl.rc_context(settings):
         yield
+
+
+styled = partial(drawn_with, RC)
 
 
 def new_figure(width: float, height: float) -> Figure:

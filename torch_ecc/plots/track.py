@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from torch_ecc.plots.envelope import Drawn, thinned
 from torch_ecc.plots.save import save
+from torch_ecc.plots.style import drawn_with
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d31", "#5e4fa2", "#444444")
 _STATUS = {"CONVERGED": "#58b98a", "MAX_ITERATIONS": "#f2a93b", "LOST": "#d6453d"}
@@ -39,7 +40,7 @@ _RC: Any = {  # told beforehand: what is changed of axes that exist already is m
 }
 
 
-@mpl.rc_context(_RC)
+@drawn_with(_RC)
 def plot_track(
     track: str | Path | Mapping[str, ArrayLike], path: str | Path, *, title: str = "", dpi: int = 130
 ) -> Path:
