@@ -101,9 +101,12 @@ def track(config: str | None, write_config: str | None, **options: Any) -> None:
         return
     if "input" not in values:
         raise ValueError("track: INPUT is missing, and no config names one")
+    import cv2
+
     from torch_ecc.commands.track import Session
 
     session = Session(fill(TrackJob, values, config or "track"))
+    cv2.setNumThreads(1)  # OpenCV's wait for each other, spinning, longer than one picture keeps them busy
     for remark in session.remarks():
         console.print(remark, soft_wrap=True, markup=False)
     with progress_bar(session.source.name, session.source.length) as advance:

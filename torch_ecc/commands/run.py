@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -49,9 +48,6 @@ class Run:
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
-        # OpenCV's threads wait for each other, spinning, longer than one picture keeps them busy.
-        self._open.callback(cv2.setNumThreads, cv2.getNumThreads())
-        cv2.setNumThreads(1)
         for writer in (self.track, *self.films):
             self._open.enter_context(writer)
         return self
