@@ -29,6 +29,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from torch_ecc.core import linearised
+from torch_ecc.core.ambient import plain
 from torch_ecc.core.condition import Gradients, condition_of, pulled
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.native import adjoint
@@ -136,6 +137,7 @@ class _Answer(torch.autograd.Function):
 answered: Callable[..., tuple[Tensor, ...]] = _Answer.apply
 
 
+@plain  # asked for within an autocast too
 def gradients(
     place: Place, image: Tensor, template: Sequence[Tensor], by_pose: Tensor | None, by_sums: Gradients
 ) -> tuple[Tensor | None, Gradients]:
