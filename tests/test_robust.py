@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import kornia.filters as KF
 import pytest
 import torch
 from engines import BACKENDS, compiled
@@ -76,6 +77,27 @@ def test_what_covers_a_part_bends_no_pose(scene, what, share, backend):
     assert share < 0.1 or (track.coverage[:, 0] < 1 - 0.5 * share).all()
     assert (track.coverage[:, 0] > 1 - share - 0.14).all()
     assert ((track.pose[:, 0] - poses[1:]).abs() < 5 * track.sigma[:, 0]).all()
+
+
+@scenes
+def test_a_thin_cover_costs_hardly_more_than_what_it_hides(scene):
+    """However long it stays."""
+    (frames, poses), there = shots(scene), [0, *[1, 2, 3] * 4]
+    frames, poses = frames[there], poses[there]
+    thin, clear = (
+        errors(noisy(some), poses)[0].square().mean().sqrt() for some in (covered(frames, 0.05, "texture"), frames)
+    )
+    assert thin < 1.6 * clear
+
+
+@scenes
+def test_blurred_edges_are_not_covered(scene):
+    """Edges that fit worse in all of the patch bend no pose more for being believed."""
+    frames, poses = shots(scene)
+    blurred = KF.gaussian_blur2d(frames[1:, None], (13, 13), (2.0, 2.0))[:, 0]
+    error, track = errors(noisy(torch.cat((frames[:1], blurred))), poses)
+    assert (track.status == Status.CONVERGED).all()
+    assert error.abs().max() < 0.15
 
 
 @scenes

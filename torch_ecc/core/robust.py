@@ -34,7 +34,9 @@ LARGEST_SLIP = 0.5  # where all do, as of blur, nothing need cover any of them
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS, FEW_ROUNDS = 8, 3  # until trust settles; where the host does not look
-CLEARLY_LESS = 0.9  # of the cost of least squares: where all edges fit worse, as by blur, leaving them out gains little
+CLEARLY_LESS = 0.9  # of the cost of least squares, where that has not found the template
+LEAST_WORSE = 0.35  # of what blocks gain, others lose: a cover fits as badly as before, but blurred edges fit worse
+WORST = 1e30  # excess of what does not fit at all
 FITS = 1.4  # median excess: nothing else is tried
 BRIGHTER = 2.0  # times the gain of least squares
 RECOGNISED = 0.9  # of the usual score: least squares that reaches it has found the template
@@ -179,8 +181,8 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
     usual = usual_scale(doubted, plain.gain, SLIP)
     first = usual, trust(compared(doubted, variance, seen, any_scale(doubted))[1])
-    best, (least, fits) = plain, cost(doubted, plain, plain.gain)
-    least, brightest = CLEARLY_LESS * least, BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
+    best, (left, fits) = plain, cost(doubted, plain, plain.gain)
+    least, brightest = CLEARLY_LESS * left.sum(1), BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
     trials: list[tuple[Tensor, tuple[Scale, Tensor] | None]] = [(there, first), (start, None), (there, None)]
     remembered = is_cpu(start.device) and bool((doubted.last < 1).any())
     if remembered:
@@ -189,12 +191,14 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
         found = reweighted(doubted, place, *(begin or median_look(doubted, place)))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
         well |= strange & recognises_most(doubted, found)
-        better = torch.where(well == fits, price < least, well)  # what fits most of it, or else what leaves less
+        better = torch.where(well == fits, price.sum(1) < least, well)  # what fits most of it, or else what leaves less
+        better = torch.where(recognised, (well >= fits) & improves(left, price), better)
         better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
         best, recognised = chosen(better, found, best), recognised & ~better
         if remembered:  # a cover mostly stays: what has led here in the last frame, and does so again, is enough
             recognised, remembered = recognised | better & covers_most(found), False
-        least, fits = torch.where(better, price, least), torch.where(better, well, fits)
+        left, fits = torch.where(better[:, None], price, left), torch.where(better, well, fits)
+        least = torch.where(better, price.sum(1), least)
         if is_cpu(start.device) and bool((fits | recognised).all()):
             break
     return best, fits
@@ -206,14 +210,21 @@ def recognises_most(doubted: Doubted, found: Solution) -> Tensor:
 
 
 def cost(doubted: Doubted, found: Solution, gain: Tensor) -> tuple[Tensor, Tensor]:
-    """What is left of templates (n,) when the noise is the usual one under a ``gain`` (n,): the mean log of the blocks'
-    excess, which asks less of what does not fit at all than of how much fits; and whether most do fit."""
+    """What is left of templates when the noise is the usual one under a ``gain`` (n,): the log of the blocks' excess,
+    which asks less of what does not fit at all than of how much fits, by their share in the mean (n, blocks); and
+    whether most do fit (n,)."""
     seen = found.sums[:, 0]
     scale = usual_scale(doubted, gain, LEAST_SLIP)
-    ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(min=1).nan_to_num(inf, inf)
-    value = (ratio.log() * seen).sum(1) / seen.sum(1).clamp(min=LEAST)
+    ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(min=1).nan_to_num(WORST, WORST)
+    ratio = torch.where(found.gain.unsqueeze(1) > 0, ratio, WORST)
     fits = weighted_median(ratio, seen)[:, 0] < FITS
-    return torch.where(found.gain > 0, value, inf), fits & (found.gain > 0)
+    return ratio.log() * seen / seen.sum(1, keepdim=True).clamp(min=LEAST), fits
+
+
+def improves(old: Tensor, new: Tensor) -> Tensor:
+    """Where (n,) from the ``old`` to the ``new`` cost (n, blocks) hardly any block gets worse."""
+    gained = old - new
+    return -gained.clamp(max=0).sum(1) < LEAST_WORSE * gained.clamp(min=0).sum(1)
 
 
 def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:
