@@ -8,7 +8,7 @@ where the engine comes to with that trust, until it settles.
 
 from __future__ import annotations
 
-from math import inf
+from math import inf, log
 from typing import NamedTuple
 
 import torch
@@ -35,7 +35,8 @@ LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothin
 SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS, FEW_ROUNDS = 8, 3  # until trust settles; where the host does not look
 CLEARLY_LESS = 0.9  # of the cost of least squares, where that has not found the template
-LEAST_WORSE = 0.35  # of what blocks gain, others lose: a cover fits as badly as before, but blurred edges fit worse
+LEAST_WORSE = 0.2  # of what blocks gain, others lose: a cover fits as badly as before, but blurred edges fit worse
+AS_BAD = 15.0  # excess: how far above it is no matter
 WORST = 1e30  # excess of what does not fit at all
 FITS = 1.4  # median excess: nothing else is tried
 BRIGHTER = 2.0  # times the gain of least squares
@@ -181,8 +182,10 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
     usual = usual_scale(doubted, plain.gain, SLIP)
     first = usual, trust(compared(doubted, variance, seen, any_scale(doubted))[1])
+    share = seen / seen.sum(1, keepdim=True).clamp(min=LEAST)
     best, (left, fits) = plain, cost(doubted, plain, plain.gain)
-    least, brightest = CLEARLY_LESS * left.sum(1), BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
+    least = CLEARLY_LESS * (left * share).sum(1)
+    brightest = BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
     trials: list[tuple[Tensor, tuple[Scale, Tensor] | None]] = [(there, first), (start, None), (there, None)]
     remembered = is_cpu(start.device) and bool((doubted.last < 1).any())
     if remembered:
@@ -191,14 +194,15 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
         found = reweighted(doubted, place, *(begin or median_look(doubted, place)))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
         well |= strange & recognises_most(doubted, found)
-        better = torch.where(well == fits, price.sum(1) < least, well)  # what fits most of it, or else what leaves less
-        better = torch.where(recognised, (well >= fits) & improves(left, price), better)
+        total = (price * share).sum(1)
+        better = torch.where(well == fits, total < least, well)  # what fits most of it, or else what leaves less
+        better = torch.where(recognised, (well >= fits) & improves(left, price, share), better)
         better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
         best, recognised = chosen(better, found, best), recognised & ~better
         if remembered:  # a cover mostly stays: what has led here in the last frame, and does so again, is enough
             recognised, remembered = recognised | better & covers_most(found), False
         left, fits = torch.where(better[:, None], price, left), torch.where(better, well, fits)
-        least = torch.where(better, price.sum(1), least)
+        least = torch.where(better, total, least)
         if is_cpu(start.device) and bool((fits | recognised).all()):
             break
     return best, fits
@@ -210,20 +214,19 @@ def recognises_most(doubted: Doubted, found: Solution) -> Tensor:
 
 
 def cost(doubted: Doubted, found: Solution, gain: Tensor) -> tuple[Tensor, Tensor]:
-    """What is left of templates when the noise is the usual one under a ``gain`` (n,): the log of the blocks' excess,
-    which asks less of what does not fit at all than of how much fits, by their share in the mean (n, blocks); and
-    whether most do fit (n,)."""
+    """What is left of templates when the noise is the usual one under a ``gain`` (n,): the log of the blocks' excess
+    (n, blocks), whose mean asks less of what does not fit at all than of how much fits; and whether most do (n,)."""
     seen = found.sums[:, 0]
     scale = usual_scale(doubted, gain, LEAST_SLIP)
     ratio = excess(residual_variance(found.sums), doubted.blocks, seen, scale).clamp(min=1).nan_to_num(WORST, WORST)
     ratio = torch.where(found.gain.unsqueeze(1) > 0, ratio, WORST)
     fits = weighted_median(ratio, seen)[:, 0] < FITS
-    return ratio.log() * seen / seen.sum(1, keepdim=True).clamp(min=LEAST), fits
+    return ratio.log(), fits
 
 
-def improves(old: Tensor, new: Tensor) -> Tensor:
-    """Where (n,) from the ``old`` to the ``new`` cost (n, blocks) hardly any block gets worse."""
-    gained = old - new
+def improves(old: Tensor, new: Tensor, share: Tensor) -> Tensor:
+    """Where (n,) from the ``old`` to the ``new`` cost (n, blocks) hardly a ``share`` of the blocks gets worse."""
+    gained = (old.clamp(max=log(AS_BAD)) - new.clamp(max=log(AS_BAD))) * share
     return -gained.clamp(max=0).sum(1) < LEAST_WORSE * gained.clamp(min=0).sum(1)
 
 
