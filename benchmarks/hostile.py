@@ -63,6 +63,12 @@ def disturbances() -> dict[str, Row]:
             for motion in covers.MOTIONS:
                 strip = partial(covers.cover, share=share, kind=kind, motion=motion)
                 rows[f"cover {100 * share:.0f} % {kind} {motion}"] = strip
+    for share in (0.02, 0.03):
+        rows[f"thin cover {100 * share:.0f} %"] = partial(covers.cover, share=share, kind="textured", motion="moving")
+    rows |= {f"needle {w} px": partial(covers.needle, width=float(w), level=g) for w, g in ((2, 250.0), (5, 20.0))}
+    rows["hair"] = partial(covers.needle, width=4.0, level=20.0, opacity=0.5)
+    rows |= {f"glass {100 * s:.0f} %": partial(covers.glass, share=s, opacity=0.4) for s in (0.2, 0.4)}
+    rows |= {f"layer {d} px aside": partial(covers.layer, share=0.2, shift=d) for d in (3, 9)}
     rows |= {f"shadow {100 * s:.0f} %": partial(covers.shadow, share=s) for s in (0.2, 0.5)}
     rows |= {f"drops {100 * s:.0f} %": partial(covers.drops, share=s) for s in (0.05, 0.1, 0.2)}
     rows |= {f"stuck {100 * s:.0f} %": partial(covers.stuck, share=s) for s in (0.05, 0.1, 0.2)}

@@ -64,6 +64,31 @@ def stuck(shot: Shot, share: float) -> Film:
     return shot.film(torch.lerp(shot.clean, torch.tensor(DARK), opacity), opacity > 0.05)
 
 
+def needle(shot: Shot, width: float, level: float, opacity: float = 1.0) -> Film:
+    """A needle or hair of a ``width`` (px) and grey ``level`` lies slantwise across the template."""
+    u = torch.rand(2, generator=torch.Generator().manual_seed(shot.seed))
+    angle, (cx, cy) = math.pi * float(u[0]), shot.path[:, :2].mean(0).tolist()
+    x, y = torch.arange(shot.frame[1]) - cx, torch.arange(shot.frame[0])[:, None] - cy
+    off = (x * math.sin(angle) - y * math.cos(angle) + shot.size / 4 * float(u[1] - 0.5)).abs()
+    hidden = torch.zeros_like(shot.clean)
+    hidden[FIRST:LAST] = opacity * (width / 2 + 0.5 - off).clamp(0, 1)
+    return shot.film(torch.lerp(shot.clean, torch.tensor(level), hidden), hidden > 0.2)
+
+
+def glass(shot: Shot, share: float, opacity: float) -> Film:
+    """Something textured drifts across the template, through which it is seen."""
+    strip = placed_strip(shot, share, "moving")
+    hidden = opacity * strip.cover(torch.zeros_like(shot.clean), torch.arange(len(shot.path)))
+    return shot.film(torch.lerp(shot.clean, surface(shot, strip, "textured"), hidden), hidden > 0.1)
+
+
+def layer(shot: Shot, share: float, shift: int) -> Film:
+    """On a strip the target's own texture is seen, ``shift`` px aside, which goes along with it."""
+    strip = placed_strip(shot, share, "still")
+    opacity = strip.cover(torch.zeros_like(shot.clean), torch.arange(len(shot.path)))
+    return shot.film(torch.lerp(shot.clean, shot.clean.roll(shift, -1), opacity), opacity > 0.5)
+
+
 def placed_strip(shot: Shot, share: float, motion: str) -> Occluder:
     """The strip; where its centre may lie leaves all of it inside the template in every frame."""
     middle = shot.path[:, :2].mean(0)
