@@ -188,12 +188,29 @@ def test_what_was_not_found_takes_the_gradient_to_its_start(problem):
         with torch.autograd.set_detect_anomaly(True):  # which tells of a NaN on the way too
             estimate = te.align(prepare(templates, criterion=criterion), image, start, min_score=0.9)
             gradients = torch.autograd.grad(estimate.pose.sum(), (image, templates, start), retain_graph=True)
+            for field in estimate.score, estimate.residual_rms, estimate.covariance.nan_to_num(posinf=0):
+                for gradient in torch.autograd.grad(field.sum(), (image, templates), retain_graph=True):
+                    assert gradient.isfinite().all()
         assert not estimate.ok.any()
         assert [bool(gradient.any()) for gradient in gradients] == [False, False, True]
         assert torch.equal(gradients[2], torch.ones_like(start))
-    others = (estimate.score + estimate.residual_rms).sum() + estimate.covariance.nan_to_num(posinf=0).sum()
-    for gradient in torch.autograd.grad(others, (image, templates)):
-        assert gradient.isfinite().all()
+
+
+def test_what_shows_nothing_leaves_the_others_gradients_as_they_are():
+    """Of whatever is asked for, with nothing that is no number on the way; one of them is beyond the frame."""
+    templates, images, start = seen()
+    reference, start = prepare(templates), start + torch.tensor([[0.0, 0, 0], [500, 500, 0], [0, 0, 0]])
+    gradients = []
+    for some in ([0, 1, 2], [0, 2]):
+        image = images[some].requires_grad_()
+        with torch.autograd.set_detect_anomaly(True):
+            estimate = te.align(reference.select(torch.tensor(some)), image, start[some])
+            parts = estimate.pose, estimate.score, estimate.residual_rms, estimate.covariance.nan_to_num(posinf=0)
+            gradients.append(torch.autograd.grad(sum(part.sum() for part in parts), image)[0])
+        plain = te.align(reference.select(torch.tensor(some)), images[some], start[some])
+        assert all(map(torch.equal, estimate, plain))
+    assert not gradients[0][1].any()
+    torch.testing.assert_close(gradients[0][[0, 2]], gradients[1], rtol=1e-4, atol=1e-6)
 
 
 def test_as_torch_asks_for_them():
@@ -223,6 +240,22 @@ def test_as_torch_asks_for_them():
     moved.mul_(2)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         pose.sum().backward()
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_autocast_changes_no_gradient(backend, dtype):
+    """Of poses sought within it: by the image asked for there too, by the template after it, as torch itself does."""
+    templates, images, start = seen()
+    for image in images, images.mT.contiguous().mT:
+        found = []
+        for autocast in False, True:
+            values = image.detach().requires_grad_(), templates.clone().requires_grad_()
+            with torch.autocast("cpu", dtype=dtype, enabled=autocast):
+                estimate = te.align(prepare(values[1]), values[0], start, backend=backend)
+                there = torch.autograd.grad(estimate.pose.sum(), values[0], retain_graph=True)
+            found.append((*there, *torch.autograd.grad(estimate.pose.sum() + estimate.score.sum(), values)))
+        assert all(map(torch.equal, *found))
 
 
 def test_nobody_pays_for_what_is_not_asked():

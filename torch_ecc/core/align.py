@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from operator import attrgetter
 
 import torch
 from torch import Tensor
@@ -13,7 +14,8 @@ from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
 from torch_ecc.core.native import engine as native
 from torch_ecc.core.pushed import Push
-from torch_ecc.core.reference import Reference
+from torch_ecc.core.reference import Reference, each
+from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution
 from torch_ecc.core.verdict import judge
@@ -91,7 +93,26 @@ def solve_again(
     with torch.no_grad():
         there = found(reference, image.detach(), pose.detach(), settings, memory)
     seen, attached = implicit.attached(reference, image, pose, there, settings)
-    return judge(seen, attached, pose, settings, origin, push), there
+    estimate = judge(seen, attached, pose, settings, origin, push)
+    return without_gradients(estimate, seen, attached, pose, settings), there
+
+
+def without_gradients(
+    estimate: Estimate, reference: Reference, found: Solution, pose: Tensor, settings: Settings
+) -> Estimate:
+    """The ``estimate``, in which templates whose patch has shown nothing have no part in a gradient: it would be 0, but
+    by way of infinity times 0. An accelerator goes that way, unless torch looks out for such, since it cannot wait."""
+    there = implicit.shown(found)
+    if not (is_cpu(pose.device) or torch.is_anomaly_enabled()) or bool(there.all()):
+        return estimate
+    some, names = there.nonzero()[:, 0], ("score", "covariance", "residual_rms")
+    none = found.gain[some[:0]].sum()  # 0, with a gradient: so it is if nothing has shown anything
+    values = [value.detach() + none for value in attrgetter(*names)(estimate)]
+    if len(some):
+        of_some = judge(reference.select(some), each(lambda value: value[some], found), pose[some], settings)
+        pairs = zip(values, attrgetter(*names)(of_some), strict=True)
+        values = [value.index_copy(0, some, more) for value, more in pairs]
+    return estimate._replace(**dict(zip(names, values, strict=True)))
 
 
 def found(

@@ -150,7 +150,7 @@ def gradients(
     found, by_normal = place.found, by_sums[3:]
     look = adjoint.look if adjoint.takes(place.reference, image, place.settings) else linearised.look
     values, by_image = look(place.reference, image, found.pose, place.settings)
-    there = (found.gain > 0) & (found.total[:, 2] > 0)
+    there = shown(found)
     values, template = where_there(there, values, Template(*template))
     condition = condition_of(place.of(template), values, partial(place.increment, values[:, 0]), template)
     inverse, solved = inverse_slope(condition.slope, turn(found.pose[:, 2]))
@@ -168,6 +168,11 @@ def gradients(
     by_patch = condition.by_patch(by_step)
     by_g = by_patch if by_g is None else by_g + by_patch
     return by_image(only(solved, by_g, 0.0)), by_template
+
+
+def shown(found: Solution) -> Tensor:
+    """Which (B,) of what was ``found`` has a gain and contrast."""
+    return (found.gain > 0) & (found.total[:, 2] > 0)
 
 
 def where_there(there: Tensor, values: Tensor, template: Template) -> tuple[Tensor, Template]:

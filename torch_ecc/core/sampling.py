@@ -141,8 +141,9 @@ class Sampler(NamedTuple):
         if self.kernel.ring == 0:
             scale = self.scale()
             turn, shift = turn * scale, shift * scale - 1
-        warp = torch.cat((turn, shift), 2).to(pixels.dtype)
-        return torch.mm(warp.view(-1, 3), pixels).view(len(warp), 2, -1)
+        held = shift.to(pixels.dtype)  # the rest is added first: else its rounding would move all pixels alike
+        warp = torch.cat((turn, shift - held), 2).to(pixels.dtype)
+        return torch.addmm(held.view(-1, 1), warp.view(-1, 3), pixels).view(len(warp), 2, -1)
 
     def _at(self, points: Tensor) -> Tensor:
         """Values (B, N) at ``points`` (B, 2, N).
