@@ -217,4 +217,6 @@ def added(some: Tensor, *gradients: Tensor | None) -> Tensor | None:
 def only(some: Tensor, value: Tensor, other: Tensor | float) -> Tensor:
     """The ``value`` (B, ...) of ``some`` templates (B,), of the rest the ``other``; a value that is not finite there is
     none to the gradient either."""
+    if is_cpu(some.device) and bool(some.all()):
+        return value
     return torch.where(some.view(-1, *[1] * (value.dim() - 1)), value, other)

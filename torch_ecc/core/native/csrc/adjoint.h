@@ -120,9 +120,22 @@ void add(float* values, int64_t pitch, int64_t at, int, const Vector (&wx)[degre
 template <int degree>
 void add(float* values, int64_t pitch, const Places& places, int n, const Vector (&wx)[degree + 1],
          const Vector (&wy)[degree + 1]) {
-  for (int i = 0; i < n; ++i)
-    for (int k = 0; k <= degree; ++k)
-      for (int l = 0; l <= degree; ++l) values[places.at[i] + k * pitch + l] += wy[k][i] * wx[l][i];
+  constexpr int size = degree == 5 ? 8 : degree + 1;
+  typedef float Taps __attribute__((vector_size(4 * size)));  // of a row
+  for (int j = 0; j < LANES; ++j) {
+    const int i = j % 4 * (LANES / 4) + j / 4;  // neighbours would wait for each other's sums
+    if (i >= n) continue;
+    Taps row, sum;
+    float weights[size] = {};
+    for (int l = 0; l <= degree; ++l) weights[l] = wx[l][i];
+    std::memcpy(&row, weights, sizeof row);
+    float* to = values + places.at[i];
+    for (int k = 0; k <= degree; ++k, to += pitch) {
+      std::memcpy(&sum, to, sizeof sum);
+      sum += wy[k][i] * row;
+      std::memcpy(to, &sum, sizeof sum);
+    }
+  }
 }
 
 // values, (4, N) of patch b.
@@ -161,7 +174,9 @@ void linearise(const View& view, int64_t b) {
       sum[3] = sum[1] * (y + line.dy * lane) - sum[2] * (x + line.dx * lane);  // eq. (2): d(x, y) / dtheta = (y, -x)
       for (int k = 0; k < 4; ++k) {
         const Vector scaled = sum[k] * unit;
-        std::memcpy(out + k * n + first + i, &scaled, 4 * std::min(left, LANES));
+        float* const to = out + k * n + first + i;
+        const bool whole = first + i + LANES <= n;  // what follows is yet to come
+        whole ? store(scaled, to) : void(std::memcpy(to, &scaled, 4 * std::min(left, LANES)));
       }
     });
   });
@@ -178,10 +193,12 @@ void spread(const View& view, int64_t b) {
   window.values.assign(window.values.size(), 0);
   const float* const by = view.values + b * view.pixels;
   lines(view, there, [&](int64_t first, const Line& line) {
-    vectors<degree>(window, line, [&](auto at, int i, int left, const Vector& fx, const Vector& fy, const Vector&) {
+    vectors<degree>(window, line, [&](auto at, int i, int left, const Vector& fx, const Vector& fy, const Vector& lane) {
       Vector wx[taps], wy[taps], value{};
       const int n = std::min(left, LANES);
-      std::memcpy(&value, by + first + i, 4 * n);
+      const bool whole = first + i + LANES <= view.pixels;
+      whole ? void(value = load<Vector>(by + first + i)) : void(std::memcpy(&value, by + first + i, 4 * n));
+      value = lane < float(i + n) ? value : Vector{};
       weigh<degree, Vector>(fx, wx);
       weigh<degree, Vector>(fy, wy);
       for (int l = 0; l < taps; ++l) wx[l] *= value * unit;
