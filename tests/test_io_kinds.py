@@ -446,3 +446,53 @@ def test_no_damage_of_a_file_is_a_surprise(tmp_path, name):
         except ValueError as error:
             said.append(str(error))
     assert all(len(each.splitlines()) == 1 for each in said)
+
+
+def write_jpegs(path: Path, packets: list[bytes]) -> None:
+    """Motion JPEG of packets of 64 x 48 px as they are."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for number, data in enumerate(packets):
+            packet = av.Packet(data)
+            packet.pts = packet.dts = number
+            packet.time_base, packet.stream = Fraction(1, 20), stream
+            container.mux(packet)
+
+
+def test_motion_jpeg_is_read_as_its_pictures_would_be(tmp_path):
+    """As JPEG files in a folder are, whatever colours they have; what libjpeg finds fault with is left to FFmpeg."""
+    rng = np.random.default_rng(0)
+    colours = cv2.resize(rng.integers(0, 256, (4, 6, 8, 3), np.uint8)[0], (64, 48), interpolation=cv2.INTER_CUBIC)
+    coded = [cv2.imencode(".jpg", np.roll(colours, k, 1))[1].tobytes() for k in range(4)]
+    write_jpegs(tmp_path / "v.mkv", [coded[0], coded[1], coded[2][:-2], coded[3][: len(coded[3]) // 2]])
+    first, second, endless, damaged = open_frames(tmp_path / "v.mkv")
+    for frame, data in ((first, coded[0]), (second, coded[1])):
+        as_file = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        np.testing.assert_array_equal(frame.pixels.numpy(), as_file)
+        shown = frame.picture().permute(1, 2, 0).numpy().astype(int)
+        assert np.abs(shown - cv2.imdecode(np.frombuffer(data, np.uint8), 1)[..., ::-1]).mean() < 2
+    wanted = cv2.imdecode(np.frombuffer(coded[2], np.uint8), cv2.IMREAD_GRAYSCALE).astype(int)
+    assert np.abs(endless.pixels.numpy() - wanted).max() <= 1
+    assert "cannot be decoded" in damaged.damage
+
+
+def test_a_jpeg_in_a_video_that_claims_another_size_is_damaged(tmp_path):
+    """Before its memory is asked for."""
+    data = cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes()
+    at = data.index(b"\xff\xc0") + 5
+    claims = data[:at] + b"\xff\xdc\xff\xdc" + data[at + 4 :]
+    write_jpegs(tmp_path / "v.mkv", [data, claims])
+    first, second = open_frames(tmp_path / "v.mkv")
+    assert first.damage is None
+    assert second.damage
+
+
+def test_motion_jpeg_without_a_luma_plane_is_left_to_ffmpeg(tmp_path):
+    colours = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    Image.fromarray(colours).save(tmp_path / "f.jpg", keep_rgb=True)
+    write_jpegs(tmp_path / "v.mkv", [(tmp_path / "f.jpg").read_bytes()])
+    with av.open(str(tmp_path / "v.mkv")) as container:
+        made = next(container.decode(video=0)).to_ndarray(format="rgb24")
+    frame = open_frames(tmp_path / "v.mkv")[0]
+    np.testing.assert_array_equal(frame.pixels.numpy(), cv2.cvtColor(made, cv2.COLOR_RGB2GRAY))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import av
 import cv2
@@ -16,6 +16,7 @@ from av.video.plane import VideoPlane
 from av.video.reformatter import ColorRange, VideoReformatter
 
 from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_size
+from torch_ecc.io.jpeg import Jpeg, grey, is_plain
 
 _KINDS = "3gp asf avi dv flv h264 hevc ivf m2ts m4v mjpeg mjpg mkv mov mp4 mpeg mpg mts mxf nut ogv ts vob webm wmv y4m"
 VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
@@ -29,7 +30,14 @@ _FULL = ((np.arange(256) - 16) * (255 / 219)).round().clip(0, 255).astype(np.uin
 
 _conversion = threading.local()  # to colours: made once for a thread, and not, six times as dear, for each frame
 
-_Decoded: TypeAlias = "av.VideoFrame | str"
+_Decoded: TypeAlias = "av.VideoFrame | Jpeg | str"
+
+
+class _Way(NamedTuple):
+    """How a file is decoded: FFmpeg's ``options``, and the size of frames of motion JPEG that are ``plain``."""
+
+    options: dict[str, str]
+    plain: tuple[int, int] | None
 
 
 def open_video(path: Path) -> Medium:
@@ -40,10 +48,10 @@ def open_video(path: Path) -> Medium:
         ratio = stream.sample_aspect_ratio or 1
         first = next((frame for _, frame in _decoded(container, stream)), "")
     # Some writers never close an image as their standard wants it: a decoder that is strict would refuse every frame.
-    options = {} if isinstance(first, str) else _STRICT
+    way = _Way({} if isinstance(first, str) else _STRICT, _plain_size(path))
     uneven = f"{path.name}: its pixels are not square, they are {float(ratio):.4g} times as wide as high"
     notes = (uneven,) if ratio != 1 else ()
-    return Medium(lambda numbers: _read(path, options, numbers), length or None, fps, notes=notes, exact=False)
+    return Medium(lambda numbers: _read(path, way, numbers), length or None, fps, notes=notes, exact=False)
 
 
 @contextmanager
@@ -78,10 +86,20 @@ def _declared(container: Any, stream: Any) -> int:
     return min(frames, by_time or frames) if "mp4" in container.format.name else frames
 
 
-def _read(path: Path, options: dict[str, str], numbers: range) -> Iterator[Raw]:
-    with _opened(path, options) as (container, stream):
+def _plain_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of frames of motion JPEG that libjpeg reads as FFmpeg does, None of all others."""
+    with _opened(path, {}) as (container, stream), suppress(av.FFmpegError):
+        if stream.codec_context.name == "mjpeg":
+            packet = next(packet for packet in container.demux(stream) if packet.size)
+            for frame in packet.decode():
+                return (frame.width, frame.height) if is_plain(packet, frame) else None
+    return None
+
+
+def _read(path: Path, way: _Way, numbers: range) -> Iterator[Raw]:
+    with _opened(path, way.options) as (container, stream):
         fps, count, last = _rate(container, stream), 0, 0.0
-        for time_s, frame in _decoded(container, stream):
+        for time_s, frame in _decoded(container, stream, way.plain):
             if count >= numbers.stop:
                 return
             last = time_s if time_s is not None and fps else (count / fps if fps else 0.0)
@@ -96,7 +114,9 @@ def _read(path: Path, options: dict[str, str], numbers: range) -> Iterator[Raw]:
             raise FrameError(count, reason)
 
 
-def _decoded(container: Any, stream: Any) -> Iterator[tuple[float | None, _Decoded]]:
+def _decoded(
+    container: Any, stream: Any, plain: tuple[int, int] | None = None
+) -> Iterator[tuple[float | None, _Decoded]]:
     """Time and frame, or the reason why there is none, in the order of their times. A damaged frame takes those with it
     that are predicted from it, up to the next one that stands by itself."""
     damaged: list[tuple[float, str]] = []
@@ -112,10 +132,11 @@ def _decoded(container: Any, stream: Any) -> Iterator[tuple[float | None, _Decod
             if guessed and packet.dts is not None:
                 slots.append(float(packet.dts * packet.time_base))
             try:
-                frames = packet.decode()
+                found = None if plain is None else grey(packet, *plain)
+                frames = packet.decode() if found is None else [found]
             except av.FFmpegError as error:
-                time = float((packet.pts or 0) * packet.time_base) if not slots else slots.pop()
-                damaged.append((time, f"it cannot be decoded ({error.strerror})"))
+                when = float((packet.pts or 0) * packet.time_base) if not slots else slots.pop()
+                damaged.append((when, f"it cannot be decoded ({error.strerror})"))
                 tainted = True
                 continue
             for frame in frames:
@@ -132,6 +153,8 @@ def _decoded(container: Any, stream: Any) -> Iterator[tuple[float | None, _Decod
 def _raw(number: int, frame: _Decoded, time_s: float | None) -> Raw:
     if isinstance(frame, str):
         return Raw(number, frame, time_s)
+    if isinstance(frame, Jpeg):
+        return Raw(number, frame.pixels, time_s, colours=frame.colours if frame.coloured else None)
     gray = _luma(frame)
     if gray is None:
         return Raw(number, _upright(_rgb(frame), frame), time_s)
