@@ -16,6 +16,7 @@ from simplejpeg import decode_jpeg, decode_jpeg_header
 from torch_ecc.io.frames import Pixels
 
 _ROUNDING = 2  # grey levels that decoders may differ by
+_GREY = 4  # that red, green and blue may be apart where chroma is rounded by one
 _LUMA = ("Gray", "YCbCr")
 
 
@@ -36,7 +37,11 @@ class Jpeg:
         return None if pts is None or base is None else float(pts * base)
 
     def colours(self) -> Pixels:
-        """(H, W, 3)."""
+        """(H, W, 3), or (H, W) where they all are grey, seen at an eighth of the size: as of most cameras that measure."""
+        h, w = self.pixels.shape
+        small = decode_jpeg(self.packet, "RGB", min_height=-(-h // 8), min_width=-(-w // 8))
+        if np.ptp(small, -1).max() <= _GREY:
+            return self.pixels
         picture: Pixels = decode_jpeg(self.packet, "RGB")
         return picture
 
