@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import repeat
 from math import ceil, floor
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -106,7 +107,7 @@ class Canvas:
     def measure(self, text: str) -> tuple[int, int]:
         """Width and height in canvas px of the label that ``text`` makes."""
         lines = text.split("\n")
-        width = max(sum(_width(self._size, letter) for letter in line) for line in lines)
+        width = max(sum(map(_width, repeat(self._size), line)) for line in lines)
         return width + 4 * self.gap, len(lines) * (_height(self._size) + self.gap) + self.gap
 
     def clamp(self, box: Box) -> Box:
@@ -120,7 +121,7 @@ class Canvas:
         cv2.rectangle(self.image, spot, _DARK, cv2.FILLED)
         cv2.rectangle(self.image, spot._replace(w=self.gap), colour, cv2.FILLED)
         for number, line in enumerate(text.split("\n")):
-            ink = np.hstack([_glyph(self._size, letter, colour) for letter in line or " "])
+            ink = np.concatenate([_glyph(self._size, letter, colour) for letter in line or " "], 1)
             top = self.gap + number * (_height(self._size) + self.gap)
             under = ground[top : top + ink.shape[0], 3 * self.gap : 3 * self.gap + ink.shape[1]]
             under[:] = ink[: under.shape[0], : under.shape[1]]

@@ -50,7 +50,7 @@ class OverlayWriter(FilmWriter):
         self._status_names, self._fps = dict(status_names), fps
         self._um = None if um_matrix is None else um_matrix.detach().cpu().numpy()
         self._outlines = [[line.numpy() for line in outlines(shape)] for shape in shapes]
-        self._trails: list[deque[NDArray[np.float64]]] = [deque(maxlen=_TRAIL_FRAMES) for _ in shapes]
+        self._trails: list[deque[tuple[float, float]]] = [deque(maxlen=_TRAIL_FRAMES) for _ in shapes]
         self._frames = 0
         self._shape: torch.Size | None = None
         self._stretch: Stretch | None = None
@@ -77,7 +77,7 @@ class OverlayWriter(FilmWriter):
         templates that were ``found`` (F, R) or not."""
         self.film.go_on(len(poses))
         for trail, pose, seen in zip(self._trails, poses.swapaxes(0, 1), found.T, strict=True):
-            trail.extend(pose[seen][-_TRAIL_FRAMES:, :2])
+            trail.extend(map(tuple, pose[seen][-_TRAIL_FRAMES:, :2].tolist()))
         self._frames = len(poses)
 
     def _fitting(self, frame: Frame) -> torch.Size | None:
@@ -104,7 +104,7 @@ class OverlayWriter(FilmWriter):
         for number, (pose, warp, score, word, outline, trail, um) in enumerate(values):
             mark = Mark(number, pose, warp, score, word, outline, trail, um)
             if not mark.lost:
-                trail.append(pose[:2])
+                trail.append((float(pose[0]), float(pose[1])))
             marks.append(mark)
         return marks
 

@@ -23,8 +23,9 @@ from torch_ecc.io.output import append, create, part, publish, reopen
 _FPS = 25.0
 _LOWEST, _HIGHEST = 0.1, 1000.0  # what players know
 _CODEC, _STREAM = "libx264", "h264"
-# Fast rather than small: the encoder must not take longer than the tracker. A key picture every 50, to jump to.
-_OPTIONS = {"preset": "ultrafast", "crf": "30", "tune": "zerolatency", "g": "50"}
+# Fast rather than small: the encoder must not take longer than the tracker, and a constant quantiser spares it a look
+# at each picture beforehand. A key picture every 50, to jump to.
+_OPTIONS = {"preset": "ultrafast", "qp": "34", "tune": "zerolatency", "g": "50"}
 
 
 class Sink(Protocol):
