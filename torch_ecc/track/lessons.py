@@ -29,7 +29,7 @@ from torch_ecc.track.surface import Surface, news, pixels, with_contrast
 
 HIGH = 0.75  # coverage: with less a frame teaches nothing
 SHARE = 0.5  # of a round's frames must have shown a pixel: else it stays what it was
-AGES = 7  # older means that are kept
+AGES = 11  # older means that are kept
 UNLIKE = 0.2  # correlation: the first mean tells nothing of a template less like it
 PASSES = 2  # in which means are placed among each other
 AT_ONCE = 4  # templates that are renewed together
