@@ -181,6 +181,24 @@ def test_another_handle_of_the_state_follows() -> None:
     assert float(handle.references[0].noise.frames) == 4
 
 
+def test_a_state_with_fewer_ages_is_filled() -> None:
+    """Saved when fewer were kept, or before they had places: it goes on as it was."""
+    frames = film(11, 2.0)
+    tracker, other = (Tracker(frames[0], [START], SIZE, renew=4, search=False) for _ in range(2))
+    tracker.track_sequence(frames[1:10])
+    state = tracker.state_dict()
+    state["lesson_older"] = state["lesson_older"][:, :3].clone()
+    state["lesson_places"] = state["lesson_places"][:, :3].clone()
+    other.load_state_dict(state)
+    assert torch.equal(other(frames[10]).pose, copy.deepcopy(tracker)(frames[10]).pose)
+    del state["lesson_places"]
+    other.load_state_dict(state)
+    assert other.lesson_places.shape == (1, AGES, 3)
+    del state["lesson_lead"]
+    with pytest.raises(ValueError, match="a tracker's state must be whole, got one without lesson_lead"):
+        other.load_state_dict(state)
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

@@ -28,12 +28,13 @@ from torch_ecc.core.pose import pose_dtype
 from torch_ecc.core.sampling import gradients
 
 BAND = 8  # frequencies in x and in y of a cell
-SMOOTH = 7  # frequencies in x and y over which a spectrum is averaged
+SMOOTH = 7  # frequencies in x and y over which a spectrum is averaged, to tell texture from noise
+SHAPE = 31  # over which what is texture is, to have its shape alone: cells weigh themselves
 DARKEST = 1e-4  # of a spectrum's largest value: no frequency counts as if there were less
 EDGE = 9  # px: over so many what counts is averaged, so that it ends softly
 FAINT = 0.05  # of full weight is what counts at least
 POOR = 0.02  # of the mean power: cells with less tell nothing
-OWN = 1e-4  # of what an image has in a cell no other explains
+OWN = 1e-5  # of what an image has in a cell no other explains
 
 
 class Places(NamedTuple):
@@ -86,8 +87,13 @@ def placed(images: Tensor, there: Tensor, noise: Tensor, counted: Tensor, centre
 
 def inner(counted: Tensor) -> Tensor:
     """By how much pixels count (B, 1, h, w), less and less towards where they do not."""
-    near = F.avg_pool2d(F.avg_pool2d(F.pad(counted, (EDGE // 2,) * 4), (EDGE, 1), 1), (1, EDGE), 1)
+    near = averaged(F.pad(counted, (EDGE // 2,) * 4), EDGE)
     return counted * (2 * near / near.amax((2, 3), keepdim=True).clamp(min=LEAST) - 1).clamp(min=FAINT)
+
+
+def averaged(image: Tensor, side: int) -> Tensor:
+    """Means of ``image`` (B, 1, h, w) over squares of a ``side``."""
+    return F.avg_pool2d(F.avg_pool2d(image, (side, 1), 1), (1, side), 1)
 
 
 def windowed(images: Tensor, there: Tensor, window: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
@@ -112,9 +118,10 @@ def whitened(shown: Tensor, slopes: Tensor, noise: Tensor) -> Tensor:
     is texture, not ``noise``, of that power (B,)."""
     h, w = (-(-k // (2 * BAND)) * 2 * BAND for k in shown.shape[2:])
     power = torch.fft.fft2(shown, s=(h, w)).abs().square().sum(1, keepdim=True)
-    power = F.avg_pool2d(F.pad(power, (SMOOTH // 2,) * 4, mode="circular"), SMOOTH, 1)
-    power = power.maximum(DARKEST * power.amax((2, 3), keepdim=True)).clamp(min=LEAST)
-    response = ((1 - noise.to(power)[:, None, None, None] / power).clamp(min=0) / power).sqrt()
+    near, shape = (averaged(F.pad(power, (side // 2,) * 4, mode="circular"), side) for side in (SMOOTH, SHAPE))
+    floor = (DARKEST * near.amax((2, 3), keepdim=True)).clamp(min=LEAST)
+    texture = (1 - noise.to(power)[:, None, None, None] / near.maximum(floor)).clamp(min=0)
+    response = (texture / shape.maximum(floor)).sqrt()
     spectra: Tensor = torch.fft.rfft2(torch.cat((shown, slopes), 1), s=(h, w)) * response[..., : w // 2 + 1]
     return spectra[..., : w // 2]
 

@@ -9,7 +9,7 @@ seen, with how far they are off: rounding of 1e-7 px each time that they are put
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.normal import LEAST
 from torch_ecc.core.patches import Crop
 from torch_ecc.core.pose import inverse as inverse_pose
-from torch_ecc.core.pose import rotation
+from torch_ecc.core.pose import pose_dtype, rotation
 from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.sampling import SAMPLERS, inside, make_sampler
 from torch_ecc.core.sight import eroded, picked
@@ -29,7 +29,7 @@ from torch_ecc.track.surface import Surface, news, pixels, with_contrast
 
 HIGH = 0.75  # coverage: with less a frame teaches nothing
 SHARE = 0.5  # of a round's frames must have shown a pixel: else it stays what it was
-AGES = 7  # older means that are kept
+AGES = 11  # older means that are kept
 UNLIKE = 0.2  # correlation: the first mean tells nothing of a template less like it
 PASSES = 2  # in which means are placed among each other
 AT_ONCE = 4  # templates that are renewed together
@@ -91,6 +91,18 @@ LESSONS = tuple(f"lesson_{name}" for name in Lessons._fields)  # their names in 
 def lessons_in(state: State) -> Lessons | None:
     """Those in the ``state`` of a tracker, None if it does not learn."""
     return Lessons(*(state[name] for name in LESSONS)) if LESSONS[0] in state else None
+
+
+def with_all_ages(state: dict[str, Any], prefix: str) -> None:
+    """What was saved with fewer means of older ages, or before these had places of their own, is filled, in place."""
+    images, places = (f"{prefix}lesson_{name}" for name in ("older", "places"))
+    older = state.get(images)
+    if isinstance(older, Tensor) and older.dim() == 4 and 0 < older.shape[1] <= AGES:
+        right = older.new_zeros(len(older), older.shape[1], 3, dtype=pose_dtype(older.device))
+        known, missing = state.get(places, right), AGES - older.shape[1]
+        state[images] = torch.cat((older, older[:, -1:].expand(-1, missing, -1, -1)), 1)
+        if isinstance(known, Tensor) and known.shape == right.shape:
+            state[places] = torch.nn.functional.pad(known, (0, 0, 0, missing))
 
 
 def noise_left(state: State) -> Tensor | None:
