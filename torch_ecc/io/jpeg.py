@@ -37,7 +37,7 @@ class Jpeg:
         return None if pts is None or base is None else float(pts * base)
 
     def colours(self) -> Pixels:
-        """(H, W, 3), or (H, W) where they all are grey, seen at an eighth of the size: as of most measuring cameras."""
+        """(H, W, 3), or (H, W) where they all are grey, seen at an eighth of the size: most cameras that measure."""
         h, w = self.pixels.shape
         small = decode_jpeg(self.packet, "RGB", min_height=-(-h // 8), min_width=-(-w // 8))
         if np.ptp(small, -1).max() <= _GREY:

@@ -215,6 +215,11 @@ class Still(NamedTuple):
         odd = bool(unusual(reference, solution, self.settings, memory.score))
         return Trial(found, odd, reference, shown)
 
+    def fits_at(self, pose: Tensor) -> bool:
+        """Whether it does as it is: then it was looked for at another place, and nothing marks it."""
+        whole = self._replace(start=pose).trial(self.shown)
+        return whole is not None and whole.fits
+
     def told(self, pose: Tensor, clean: Reference) -> Trial | None:
         """Without the marks that are told from a ``pose`` (1, 3) on, and a template that is ``clean`` of them as far as
         one knows; None if it then does not fit."""
@@ -222,7 +227,9 @@ class Still(NamedTuple):
             seen = look(self, pose, clean)
             marks = seen.within(seen.marks, self.shown) & self.shown
             trial = self.trial(self.shown & ~marks) if bool(marks.any()) else None
-            if trial is None or trial.fits:
+            if trial is None or (trial.fits and self.fits_at(trial.estimate.pose)):
+                return None
+            if trial.fits:
                 return trial
             if not Status.good(trial.estimate.status):
                 return None
