@@ -12,7 +12,6 @@ mark unless the template fits without it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,7 +20,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.align import solve_again
-from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.noise import noise_level
 from torch_ecc.core.normal import LEAST
@@ -32,22 +30,16 @@ from torch_ecc.core.sampling import Sampler, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import eroded, picked, seen_through
 from torch_ecc.core.verdict import expected_score, within_margin
-from torch_ecc.search.locate import pose_distance
 from torch_ecc.track.frame_mask import unexplained
-from torch_ecc.track.look import Look as TrackersLook
 
 AROUND = 3  # px: pixels are compared in squares of so many
 STILL = 3.0  # times the noise of a difference: so much is left of squares that stand still
 EXCESS = 9.0  # times it, and
 CONTRAST = 0.2  # of the template's, must be left by the template, which light and the sampler do not leave
 BELIEVED = 0.95  # of what is in sight must fit without the marks
-ELSEWHERE = 2.0  # px, of its farthest pixel: what fits there has no mark in it that one does not know of
-FARTHER = 1.5  # times as far one looks again
 BY_CHANCE = 3.0  # standard deviations of what noise may leave
 QUIET, TO_MEAN = 0.3, 1.41  # a quantile of what noise leaves of squares, and their mean over it
 ROUNDS = 3  # in which they are told from poses that they bend less and less
-
-State = Mapping[str, Tensor]
 
 
 class Look(NamedTuple):
@@ -267,77 +259,3 @@ class Still(NamedTuple):
         spread: Tensor = reweigh(reference, moving).normal.inverse[:, :3, :3] * more.clamp(min=0)
         doubt: Tensor = axes @ (spread + spread.mT) @ axes.mT / 2
         return doubt
-
-
-class Watch(NamedTuple):
-    """What a tracker's state holds of R templates: the ``marks`` (H, W) of the camera, and which of them ``heed`` (R,)
-    these, 0 or 1 each; for how many frames (R,) more was left of them than noise leaves, and ``no_mark`` was found; how
-    ``far`` (R,) px from their places in the first frame one has looked in vain; where they were, ``fitted`` (R, 3),
-    when last no more was left than noise; and the first frame's ``level`` (2,), mean and standard deviation in grey
-    levels."""
-
-    marks: Tensor
-    heed: Tensor
-    no_mark: Tensor
-    far: Tensor
-    fitted: Tensor
-    level: Tensor
-
-    @staticmethod
-    @lasting
-    def begin(frame: Tensor, start: Tensor) -> Watch:
-        """Of templates at ``start`` (R, 3) in a ``frame`` (1 or R, 1, H, W)."""
-        none = torch.zeros_like(start[:, 0])
-        level = torch.stack((frame.mean(), frame.var(correction=0).sqrt()))
-        marks = torch.zeros_like(frame[0, 0], dtype=torch.uint8)
-        return Watch(marks, none.to(torch.uint8), none.long(), none, start.clone(), level)
-
-    @staticmethod
-    def of(state: State) -> Watch:
-        """From a tracker's buffers."""
-        return Watch(*(state[name] for name in Watch._fields))
-
-    def seen(self, reference: Reference, home: Tensor) -> Reference:
-        """The templates, cut at ``home`` (R, 3), through a camera with these marks."""
-        return behind(reference, home, self.marks > 0, self.heed > 0)
-
-    def due(self, odd: Tensor, moved: Tensor) -> list[int]:
-        """Which of the templates that leave more than noise does, ``odd`` (R,) bool, and have ``moved`` (R,) px, to
-        look at: more and more seldom if there is nothing to find, but again farther off."""
-        each_one = zip(odd.tolist(), self.no_mark.tolist(), moved.tolist(), self.far.tolist(), strict=True)
-        self.no_mark.add_(odd)
-        return [r for r, (o, n, d, f) in enumerate(each_one) if o and (n & (n - 1) == 0 or d > FARTHER * f + AROUND)]
-
-
-@torch.no_grad()
-def without_marks(
-    tracker: TrackersLook, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor | None
-) -> tuple[Estimate, bool]:
-    """The ``estimate`` of R templates of a ``tracker`` in an ``image`` (1, 1, H, W), from the ``start`` (R, 3) on,
-    without the marks that it shows where there is more left than any noise leaves, ``odd`` (R,) bool, None if it is
-    known that there is none; and whether there are new ones, in the state."""
-    state, reference = tracker.state, tracker.references[0]
-    watch = Watch.of(state)
-    if odd is None:
-        watch.fitted.copy_(estimate.pose)
-        return estimate, False
-    watch.fitted.copy_(torch.where(odd[:, None], watch.fitted, estimate.pose))
-    radius, found = reference.place.radius, False
-    moved, fitted = (pose_distance(pose, state["start"], radius=radius) for pose in (estimate.pose, watch.fitted))
-    pure = ((fitted > ELSEWHERE) & (watch.heed == 0)).tolist()
-    for r in watch.due(odd, moved):
-        at = torch.tensor([r], device=start.device)
-        alone = reference._replace(sight=None, heed=None).select(at)
-        first, home = state["first"][0, 0], state["start"][at]
-        still = Still(alone, image, first, watch.level, start[at], home, watch.marks == 0, pure[r], tracker.settings)
-        trial = still.without_marks(estimate.pose[at])
-        if trial is None:
-            watch.far[r] = moved[r].maximum(watch.far[r])
-            if not pure[r] and bool(Status.good(estimate.status[at])):
-                estimate.covariance[at] += still.doubt(estimate.pose[at], state["trust"][at])
-            continue
-        estimate, found = estimate.put(at, trial.estimate), True
-        watch.marks.copy_(~trial.shown)
-        watch.heed[r], watch.no_mark[r], watch.far[r] = 1, 0, 0
-        state["score"][r], state["trust"][r] = expected_score(trial.reference)[0], 1
-    return estimate, found

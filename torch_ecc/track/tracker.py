@@ -32,10 +32,10 @@ from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
 from torch_ecc.track.sensor import dead_in, kept, shown
 from torch_ecc.track.shutter import Shutter
-from torch_ecc.track.still import Watch, without_marks
 from torch_ecc.track.textureless import warn_of_textureless
+from torch_ecc.track.watch import Marks, Watch
 
-DERIVED = ("references", "_look", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
+DERIVED = ("references", "_look", "_marks", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
 
 
 class SequenceError(ValueError):
@@ -196,8 +196,9 @@ class Tracker(nn.Module):
 
     @property
     def watches(self) -> bool:
-        """Whether it looks for marks of its camera, ``track.still``: one that exposes all rows at once."""
-        return self.finds_marks and self.settings.robust and self.frame_shape[0] == 1 and self.shutter.line == 0
+        """Whether it looks for marks of its camera, ``track.watch``: one that exposes all rows at once."""
+        told = self.frame_mask is not None or not self.settings.robust
+        return not told and self.frame_shape[0] == 1 and self.shutter.line == 0
 
     def _prepared(self, state: Mapping[str, Tensor]) -> list[Reference]:
         """Every level of the templates in a ``state``."""
@@ -210,8 +211,9 @@ class Tracker(nn.Module):
 
     def _use(self, references: list[Reference]) -> None:
         """Goes on with ``references``, in what the camera shows."""
-        watch, first = Watch.of(self._buffers), seen_through(references[0], self.frame_mask)
-        self.references = [watch.seen(first, self.start) if self.watches else first, *references[1:]]
+        first, marks = seen_through(references[0], self.frame_mask), self.finds_marks
+        self._marks = Marks.of(first, self.settings, self._buffers, marks) if self.watches else None
+        self.references = [self._marks.reference if self._marks else first, *references[1:]]
         budget = Budget(self.credit, self.turn, math.prod(self.frame_shape), self.template.numel())
         self._recovery = Recovery(self.references[0], self.settings, budget, self.max_step)
         moving = self.prediction == "velocity"
@@ -323,8 +325,8 @@ class Tracker(nn.Module):
         images = [image.detach()]
         self._recovery.budget.earn(self.income)
         start, estimate, odd = self._look(image, images)
-        if self.watches:
-            estimate, marked = without_marks(self._look, images[0], estimate, start, odd)
+        if self._marks is not None:
+            estimate, marked = self._marks(images[0], estimate, start, odd)
             if marked:
                 self._use(self.references)
         estimate, past = self._within_reach(estimate), Past.of(state)
