@@ -61,6 +61,31 @@ def test_marks_that_nobody_has_told_of_bend_no_pose(mark: str) -> None:
     assert off(plain, motion)[2:, :2].max() > 0.3  # else this says nothing
 
 
+@marks
+def test_marks_bring_a_pose_into_doubt_where_nobody_asks_for_them(mark: str) -> None:
+    """Sigma covers what they do, and no other place is believed."""
+    motion = path()
+    frames = filmed(motion, SHOWN[mark])
+    track = Tracker(frames[0], CENTER, SIZE).track_sequence(frames[1:])
+    error, far = off(track, motion), torch.tensor([0.1, 0.1, 0.1 * torch.pi / 180])
+    assert (track.status == Status.CONVERGED).all()
+    assert not ((error > far) & (error > 5 * track.sigma[:, 0])).any()
+    assert error[2:, :2].max() < 0.5
+
+
+def test_marks_cost_no_gradient() -> None:
+    """Of what they bring into doubt the poses are as before, with their gradients."""
+    motion = path()
+    frames = filmed(motion, SHOWN["dust"]).float()
+    tracker = Tracker(frames[0], CENTER, SIZE)
+    tracker.track_sequence(frames[1:3])
+    assert tracker.heed.tolist() == [2]
+    estimate = tracker(frames[3].requires_grad_())
+    estimate.pose.sum().backward()
+    assert frames.grad is None
+    assert estimate.pose.requires_grad
+
+
 @pytest.mark.parametrize("light", [1.0, 0.7])
 def test_a_camera_without_marks_has_none(light: float) -> None:
     """However the target moves, and where it is covered."""
@@ -70,10 +95,13 @@ def test_a_camera_without_marks_has_none(light: float) -> None:
     covered = frames.clone()
     covered[5:, 60:90, 70:85] = 90
     for shown in (frames, covered, covered[4:5].expand(8, -1, -1), frames[:1].expand(8, -1, -1)):
-        tracker = Tracker(shown[0], CENTER, SIZE, frame_mask="find")
-        tracker.track_sequence(shown[1:])
-        assert not tracker.marks.any()
-        assert not tracker.heed.any()
+        for asked in ("find", None):
+            tracker = Tracker(shown[0], CENTER, SIZE, frame_mask=asked)
+            track = tracker.track_sequence(shown[1:])
+            assert not tracker.marks.any()
+            assert not tracker.heed.any()
+        told = Tracker(shown[0], CENTER, SIZE, frame_mask=torch.ones(SHAPE)).track_sequence(shown[1:])
+        torch.testing.assert_close(track.covariance, told.covariance, atol=0, rtol=1e-6)
 
 
 def test_templates_that_marks_do_not_bend_do_not_heed_them() -> None:

@@ -15,7 +15,7 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.solution import Solution
 
-LEAST_UNLIKE = 0.05  # of the template's power: as much noise of any kind, light and the sampler may leave
+LEAST_UNLIKE = 0.01  # of the template's power: as much noise of any kind, light and the sampler may leave
 CLINGS = 1.5  # times as much as noise must residuals cling together: they are not noise, however much there is
 
 

@@ -35,7 +35,7 @@ from torch_ecc.track.shutter import Shutter
 from torch_ecc.track.textureless import warn_of_textureless
 from torch_ecc.track.watch import Marks, Watch
 
-DERIVED = ("references", "_look", "_marks", "_recovery", "_crowd", "_teacher", "_version")  # what follows from the state
+DERIVED = ("references", "_look", "_marks", "_recovery", "_crowd", "_teacher", "_version")  # follow from the state
 
 
 class SequenceError(ValueError):
@@ -197,8 +197,7 @@ class Tracker(nn.Module):
     @property
     def watches(self) -> bool:
         """Whether it looks for marks of its camera, ``track.watch``: one that exposes all rows at once."""
-        told = self.frame_mask is not None or not self.settings.robust
-        return not told and self.frame_shape[0] == 1 and self.shutter.line == 0
+        return self.frame_mask is None and self.settings.robust and self.frame_shape[0] == 1 and self.shutter.line == 0
 
     def _prepared(self, state: Mapping[str, Tensor]) -> list[Reference]:
         """Every level of the templates in a ``state``."""

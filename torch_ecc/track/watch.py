@@ -1,9 +1,9 @@
 """What a tracker knows of marks of its camera from frame to frame, and what they make of poses.
 
-A sheen that stays where it is while a target moves is like a mark, but leaving out where it lies would cost more than it
-bends. So unless one asks for marks to be heeded, a pose remains as it is, and its covariance tells where it would be
-without what may be one. Only where that is another place altogether, as of a template that follows an aperture, or the
-template was lost, is it taken instead.
+A sheen that stays where it is while a target moves is like a mark, but leaving out where it lies may cost more than it
+bends. So unless one asks for marks to be heeded a pose remains as it is, and its covariance tells how far from it the
+one is that there would be without them. Only where that is another place altogether, as of a template that follows an
+aperture, or where the template was lost, is it taken instead.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from torch_ecc.core.align import solve_again
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.covariance import largest_variance
 from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.grid import Place
 from torch_ecc.core.normal import LEAST
-from torch_ecc.core.reference import Place, Reference
+from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import Memory, unusual
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.verdict import LARGEST_SIGMA, expected_score
 from torch_ecc.search.locate import pose_distance
-from torch_ecc.track.still import AROUND, Still, Trial, behind
+from torch_ecc.track.still import AROUND, Still, behind
 
 HEEDED, DOUBTED = 1, 2  # of marks: the template is seen without them; they may be some
 ELSEWHERE = 2.0  # px, of its farthest pixel: what fits there has no mark in it that one does not know of
@@ -136,27 +137,35 @@ class Marks:
         moved, fitted = (pose_distance(there, home, radius=radius) for there in (pose, watch.fitted))
         pure = ((fitted > ELSEWHERE) & (watch.heed == 0)).tolist()
         doubt, odd = self.known(image, estimate, start, odd)
-        instead: dict[int, Estimate] = {}
-        new = False
+        found = Found(doubt, {}, False)
         for r in watch.due(odd, moved):
             at = torch.tensor([r], device=start.device)
-            still = self.still(at, image, start, pure[r])
-            trial = self.trial(still, pose[at], int(watch.heed[r]))
-            if trial is None:
-                watch.far[r] = moved[r].maximum(watch.far[r])
-                unknown = not pure[r] and int(watch.heed[r]) == 0 and bool(Status.good(estimate.status[r]))
-                doubt[r] += still.doubt(pose[at], self.state["trust"][at])[0] if unknown else 0.0
-                continue
-            more, other = apart(self.reference.place, estimate.at(at), trial.estimate, at)
-            taken = self.asked or int(watch.heed[r]) == HEEDED or bool(other | ~Status.good(estimate.status[at]))
-            if taken:
-                instead[r] = trial.estimate
-                self.state["score"][r], self.state["trust"][r] = expected_score(trial.reference)[0], 1
-            else:
-                doubt[r] = more[0]
-            watch.marks.copy_(~trial.shown)
-            watch.heed[r], watch.no_mark[r], watch.far[r], new = HEEDED if taken else DOUBTED, 0, 0, True
-        return Found(doubt, instead, new)
+            found = self.looked(self.still(at, image, start, pure[r]), at, found, estimate.at(at), moved[r])
+        return found
+
+    def looked(self, still: Still, at: Tensor, found: Found, estimate: Estimate, moved: Tensor) -> Found:
+        """What was ``found``, and what a look tells at the template ``at`` (1,) that has ``moved`` () px, as far as its
+        ``estimate`` (1, ...) is right."""
+        watch, state, pose = Watch.of(self.state), self.state, estimate.pose
+        good, heed = bool(Status.good(estimate.status)), int(watch.heed[at])
+        trial = still.trial(still.shown) if heed == DOUBTED else None
+        if trial is None or not trial.fits:
+            trial = still.without_marks(pose)
+        if trial is None:
+            watch.far[at] = watch.far[at].maximum(moved)
+            if good and heed == 0 and not still.pure and bool(moved <= ELSEWHERE):  # farther off a mark shows
+                found.doubt[at] += still.doubt(pose, state["trust"][at])
+            return found
+        more, other = apart(self.reference.place, estimate, trial.estimate, at)
+        taken = self.asked or heed == HEEDED or not good or bool(other)
+        if taken:
+            found.instead[int(at)] = trial.estimate
+            state["score"][at], state["trust"][at] = expected_score(trial.reference), 1
+        else:
+            found.doubt[at] = more
+        watch.marks.copy_(~trial.shown)
+        watch.heed[at], watch.no_mark[at], watch.far[at] = HEEDED if taken else DOUBTED, 0, 0
+        return found._replace(new=True)
 
     def still(self, at: Tensor, image: Tensor, start: Tensor, pure: bool) -> Still:
         """The template ``at`` (1,)."""
@@ -164,12 +173,6 @@ class Marks:
         alone, first = self.reference._replace(sight=None, heed=None).select(at), state["first"][0, 0]
         shown, home = watch.marks == 0, state["start"][at]
         return Still(alone, image, first, watch.level, start[at], home, shown, pure, self.settings)
-
-    @staticmethod
-    def trial(still: Still, pose: Tensor, heed: int) -> Trial | None:
-        """One template without the marks that are known or seen at a ``pose`` (1, 3); None if it does not fit so."""
-        trial = still.trial(still.shown) if heed == DOUBTED else None
-        return trial if trial is not None and trial.fits else still.without_marks(pose)
 
     def known(self, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor) -> tuple[Tensor, Tensor]:
         """By what marks that are known bring poses into doubt, (R, 3, 3), and which (R,) are ``odd`` for all that."""
