@@ -57,8 +57,9 @@ class Tracker(nn.Module):
     (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``frame_mask``: (H, W), True or > 0 where the
     camera shows the scene, and not a mark of its own (aperture, stripe, dust): what of a template is there, or within
     some 3 to 6 px, is out of sight, as beyond the frame's border, or "find": what stays where it was in the first
-    frame while the templates move is taken for such marks (``track.still``; a sheen that stays may be, too);
-    ``device``: where everything lives (default: the frame's); ``min_score``: below it a template is lost;
+    frame while the templates move is taken for such marks (``track.still``; a sheen that stays may be, too), which by
+    default add to sigma alone unless they lead elsewhere (``track.watch``); ``device``: where everything lives
+    (default: the frame's); ``min_score``: below it a template is lost;
     ``min_visible``: with less of its weight in sight it is out of view; ``robust``: blocks of pixels that do not fit,
     as of what covers a part of a template, count less (``core.robust``); ``search``: look for a template that is lost,
     or looks less like itself than usual, near where it is expected and, if it has no plausible place, in the whole
