@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import Criterion, make_criterion, named
-from torch_ecc.core.dead_lines import DeadLines
 from torch_ecc.core.estimate import Estimate, Reason, Status, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
@@ -254,7 +253,7 @@ class Tracker(nn.Module):
         device = fn(self.score).device
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
         self.frame_mask = None if self.frame_mask is None else self.frame_mask.to(device)
-        self.dead = None if self.dead is None else DeadLines(*(lines.to(device) for lines in self.dead))
+        self.dead = None if self.dead is None else self.dead.to(device)
         self._use([reference.map(lambda tensor: tensor.to(device)) for reference in self.references])
         return self
 
