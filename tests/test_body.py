@@ -259,6 +259,8 @@ def test_a_lost_patch_is_looked_for_where_its_body_says():
     ("groups", "message"),
     [
         ([], "groups must be one list of patch numbers per body, got none"),
+        ([0, 1], r"groups must be one list of patch numbers per body, got \[0, 1\]"),
+        (3, "groups must be one list of patch numbers per body, got 3"),
         ([[0], []], "group 1 must hold at least one patch"),
         ([[0, 16]], "group 0 must hold numbers of patches from 0 to 15, got 16"),
         ([[0, 1], [1]], "patch 1 must be in one group, got it in 0 and 1"),
@@ -267,6 +269,16 @@ def test_a_lost_patch_is_looked_for_where_its_body_says():
 def test_groups_that_are_none(tracker, groups, message):
     with pytest.raises(ValueError, match=message):
         Body(tracker, groups)
+
+
+def test_what_is_no_tracker_lens_or_estimate(tracker):
+    for make, message in (
+        (lambda: Body(None), "tracker must be a Tracker, got NoneType"),
+        (lambda: Body(tracker, lens=0.1), "lens must be a Lens, got float"),
+        (lambda: Body(tracker)(torch.ones(16, 3)), "estimate must be an Estimate or a Track, got Tensor"),
+    ):
+        with pytest.raises(ValueError, match=f"Body: {message}"):
+            make()
 
 
 def test_estimates_of_other_patches(tracker):

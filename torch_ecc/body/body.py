@@ -111,6 +111,10 @@ class Body(nn.Module):
         self, tracker: Tracker, groups: Sequence[Sequence[int]] | None = None, lens: Lens | None = None
     ) -> None:
         super().__init__()
+        if not isinstance(tracker, Tracker):
+            raise ValueError(f"Body: tracker must be a Tracker, got {type(tracker).__name__}")
+        if not isinstance(lens, Lens | None):
+            raise ValueError(f"Body: lens must be a Lens, got {type(lens).__name__}")
         start = tracker.start
         groups = [range(len(start))] if groups is None else groups
         _check_groups(groups, len(start))
@@ -124,6 +128,8 @@ class Body(nn.Module):
     @torch.no_grad()
     def forward(self, estimate: Estimate) -> BodyEstimate:
         """Bodies in a frame, (R, ...) -> (G, ...), or in the F frames of a track. ValueError for other patches."""
+        if not isinstance(estimate, Estimate):
+            raise ValueError(f"Body: estimate must be an Estimate or a Track, got {type(estimate).__name__}")
         layout = self._layout(estimate.pose.device)
         if estimate.pose.shape[-2:] != layout.place.shape:
             raise ValueError(f"Body: estimate must be of {len(layout.place)} patches, got {tuple(estimate.pose.shape)}")
@@ -209,6 +215,8 @@ def _warn_of_overlap(groups: Sequence[Sequence[int]], start: Tensor, size: Seque
 def _check_groups(groups: Sequence[Sequence[int]], count: int) -> None:
     """ValueError for groups of no patch, of patches that there are not, or that share one."""
     seen: dict[int, int] = {}
+    if not hasattr(groups, "__len__") or not all(hasattr(group, "__len__") for group in groups):
+        raise ValueError(f"Body: groups must be one list of patch numbers per body, got {groups!r}")
     if len(groups) == 0:
         raise ValueError("Body: groups must be one list of patch numbers per body, got none")
     for g, group in enumerate(groups):
