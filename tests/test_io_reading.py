@@ -17,6 +17,7 @@ import torch
 from PIL import Image
 
 from torch_ecc.io import Frame, FrameError, FrameSource, live, open_frames
+from torch_ecc.io.beside import ahead
 
 DTYPES = [np.uint8, np.uint16, np.float32]
 F, H, W = 12, 10, 14
@@ -592,3 +593,23 @@ def test_bad_cameras(monkeypatch, source, error, message):
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
     with pytest.raises(error, match=message):
         open_frames(source)
+
+
+def test_reading_ahead_is_given_up_without_waiting():
+    """Whoever closes it may be the garbage collector, in a thread that holds locks."""
+    begun, closed, ended = threading.Event(), threading.Event(), threading.Event()
+    waited = []
+
+    def slow():
+        yield from range(4)
+        begun.set()
+        waited.append(closed.wait(60))
+        ended.set()
+
+    frames = ahead(slow())
+    assert next(frames) == 0
+    assert begun.wait(60)
+    frames.close()
+    closed.set()
+    assert ended.wait(60)
+    assert waited == [True]

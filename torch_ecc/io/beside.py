@@ -18,20 +18,21 @@ def ahead(items: Iterable[T]) -> Iterator[T]:
 
     Several at once: two threads that meet at every frame take a tenth more of a busy processor's time.
     """
-    source = iter(items)
-    with ThreadPoolExecutor(1, "ahead") as thread:
-        waiting = deque(thread.submit(_some, source) for _ in range(2))
-        try:
-            while True:
-                made, error = waiting.popleft().result()
-                waiting.append(thread.submit(_some, source))
-                yield from made
-                if error is not None:
-                    raise error
-                if len(made) < _AHEAD:
-                    return
-        finally:
-            thread.shutdown(cancel_futures=True)
+    source, thread = iter(items), ThreadPoolExecutor(1, "ahead")
+    waiting = deque(thread.submit(_some, source) for _ in range(2))
+    try:
+        while True:
+            made, error = waiting.popleft().result()
+            waiting.append(thread.submit(_some, source))
+            yield from made
+            if error is not None:
+                raise error
+            if len(made) < _AHEAD:
+                return
+    finally:
+        # Not waited for: what is left behind with an error is closed by the garbage collector, which may run in a
+        # thread that is just being started, and holds the lock that one that ends has to take.
+        thread.shutdown(wait=False, cancel_futures=True)
 
 
 def _some(source: Iterator[T]) -> tuple[list[T], Exception | None]:
