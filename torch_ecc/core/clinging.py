@@ -28,10 +28,12 @@ SURE = 3.0  # standard deviations by which lines must scatter more than blocks d
 
 class Clinging(NamedTuple):
     """``scatter`` (B, 1, 3): by how many times more than white noise each row of K feels the residuals, at least 1;
+    ``ratio`` (B, 3, 3): the same of blocks, and of rows and columns of them over what these may be by chance;
     ``strained`` (B, 3, 3): covariance of what the pose of a strained target may be off by, in the template's axes.
     None where nothing clings together, or nobody can tell."""
 
     scatter: Tensor | None
+    ratio: Tensor | None
     strained: Tensor | None
 
 
@@ -51,24 +53,24 @@ def clinging(reference: Reference, found: Solution, white: Tensor, scale: Tensor
     """What clings together in the residuals of B templates whose template and frame have noise of variance ``white``
     (B,) together if it is that, with clusters of a ``scale_of``."""
     if scale is None:
-        return Clinging(None, None)
+        return Clinging(None, None, None)
     unit, on_cpu = scale / white.unsqueeze(1), is_cpu(white.device)
     ratio = (found.total[:, SUMS:] * unit).view(-1, 3, 3)
     scatter = ratio[:, :1].clamp(min=1.0)
     certain = (ratio > scatter).flatten(1).any(1)  # of lines, that they scatter more; blocks never do
     if on_cpu and not bool(certain.any()):
-        return Clinging(scatter, None)
+        return Clinging(scatter, ratio, None)
     all_of_it = Residuals(found.sums[:, 7:], ratio, unit, found.gain, strains(reference, found))
     if not on_cpu or bool(certain.all()):
         more, strained = explained(all_of_it, reference.grid.blocks)
         chosen = certain[:, None, None]
         strained = None if strained is None else torch.where(chosen, strained, 0.0)
-        return Clinging(torch.where(chosen, more, scatter), strained)
+        return Clinging(torch.where(chosen, more, scatter), ratio, strained)
     index = certain.nonzero()[:, 0]
     more, strained = explained(each(lambda value: value[index], all_of_it), reference.grid.blocks)
     none = scatter.new_zeros(len(scatter), 3, 3)
     strained = None if strained is None else none.index_copy(0, index, strained)
-    return Clinging(scatter.index_copy(0, index, more), strained)
+    return Clinging(scatter.index_copy(0, index, more), ratio, strained)
 
 
 def scale_of(grid: Grid, normal: Normal) -> Tensor | None:

@@ -8,8 +8,10 @@ correlates, of which the template has few.
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
+from torch_ecc.core.clinging import Clinging
 from torch_ecc.core.normal import LEAST
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import is_cpu
@@ -19,15 +21,23 @@ LEAST_UNLIKE = 0.01  # of the template's power: as much noise of any kind, light
 CLINGS = 1.5  # times as much as noise must residuals cling together: they are not noise, however much there is
 
 
-def unlike(reference: Reference, found: Solution, score: Tensor, scatter: Tensor | None) -> Tensor | None:
+def unlike(reference: Reference, found: Solution, score: Tensor, clings: Clinging) -> Tensor | None:
     """What it adds to the covariance (B, 3, 3) of poses, in the template's axes, of this ``score`` (B,) and with
-    residuals that ``scatter`` (B, 1, 3) times as much as noise, see ``clinging``. None if it is known that there is
-    nothing like it."""
-    if scatter is None or (is_cpu(score.device) and none_at_all(score.tolist(), scatter[:, 0].tolist())):
+    residuals that ``clings`` together. None if it is known that there is nothing like it.
+
+    It clings together along rows of blocks and along columns. The lines of a sensor do along one of them.
+    """
+    scatter, ratio, _ = clings
+    if (
+        scatter is None
+        or ratio is None
+        or (is_cpu(score.device) and none_at_all(score.tolist(), scatter[:, 0].tolist()))
+    ):
         return None
     normal, power = found.normal, found.gain.square()
     left = found.total[:, 6] / (power * normal.total).clamp(min=LEAST) - LEAST_UNLIKE * normal.contrast
     amount = left.clamp(min=0) * (1 - CLINGS / scatter.mean((1, 2))).clamp(min=0) * reference.patch
+    amount = torch.where(ratio[:, 1:].amin(1).mean(1) > 1, amount, 0.0)
     block = normal.inverse[:, :3, :3]
     return amount[:, None, None] * (block @ normal.meat @ block.mT)
 

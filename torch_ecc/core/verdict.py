@@ -109,17 +109,17 @@ def judge(
     variance = error / torch.addcmul(constant.free, power, constant.template_free)
     of_template = variance * constant.per_frame
     bias, white = torch.minimum(of_template, reference.noise.power), torch.addcmul(variance, of_template, power)
-    scatter, strained = clinging(reference, found, white, constant.clusters)
+    clings = clinging(reference, found, white, constant.clusters)
     coherent = None if settings.interpolation not in reference.noise.alias else coherence(axes, reference.grid.sides)
-    covariance = pose_covariance(constant.sandwich, variance, power, bias, scatter, coherent)
-    unseen = hidden(reference, found, variance / power), unlike(reference, found, score, scatter)
+    covariance = pose_covariance(constant.sandwich, variance, power, bias, clings.scatter, coherent)
+    unseen = hidden(reference, found, variance / power), unlike(reference, found, score, clings)
     unobservable = largest_variance(reference.place.lever2, covariance), constant.share * bias
     visible, believed = seen_and_believed(reference, found)
     share, on_cpu = normal.noise_share * variance, is_cpu(pose.device)
     if push is not None and normal is reference.normal and not (on_cpu and max(share.tolist()) <= LEAST_SHARE):
         share = push.unanswered(share)
     amounts = visible, score, found.gain, believed, *unobservable, found.error, share
-    for more in (strained, *unseen):  # which are no lack of texture
+    for more in (clings.strained, *unseen):  # which are no lack of texture
         covariance = covariance if more is None else covariance + more
     covariance = torch.bmm(torch.bmm(axes, covariance), axes.mT)
     tracked, status, reason = (codes.clone() for codes in _zeros(len(pose), pose.device))
