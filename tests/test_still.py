@@ -71,6 +71,7 @@ def test_marks_bring_a_pose_into_doubt_where_nobody_asks_for_them(mark: str) -> 
     assert (track.status == Status.CONVERGED).all()
     assert not ((error > far) & (error > 5 * track.sigma[:, 0])).any()
     assert error[2:, :2].max() < 0.5
+    assert (torch.linalg.eigvalsh(track.covariance) > 0).all()
 
 
 def test_marks_cost_no_gradient() -> None:

@@ -114,5 +114,9 @@ def interpolation_error(reference: Reference, axes: Tensor, interpolation: str) 
 
 
 def largest_variance(lever2: Tensor, covariance: Tensor) -> Tensor:
-    """Variance (B,) of the place of a pixel with squared ``lever2`` (B, 3), px^2, under a ``covariance`` (B, 3, 3)."""
-    return (covariance.diagonal(dim1=1, dim2=2) * lever2).sum(1)
+    """Variance (B,) of the place of a pixel with squared ``lever2`` (B, 3), px^2, under a ``covariance`` (B, 3, 3).
+
+    Where the template is mostly noise, what is taken out for that may leave less than none of one component.
+    """
+    along: Tensor = torch.linalg.vector_norm(covariance.diagonal(dim1=1, dim2=2) * lever2, 1, 1)
+    return along

@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.align import solve_again
+from torch_ecc.core.covariance import largest_variance
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.noise import noise_level
 from torch_ecc.core.normal import LEAST
@@ -39,6 +40,7 @@ CONTRAST = 0.2  # of the template's, must be left by the template, which light a
 BELIEVED = 0.95  # of what is in sight must fit without the marks
 BY_CHANCE = 3.0  # standard deviations of what noise may leave
 QUIET, TO_MEAN = 0.3, 1.41  # a quantile of what noise leaves of squares, and their mean over it
+UNSEEN = 1.0  # px: what holds it back by more has been told before, as a mark
 ROUNDS = 3  # in which they are told from poses that they bend less and less
 
 
@@ -250,8 +252,8 @@ class Still(NamedTuple):
 
     def doubt(self, pose: Tensor, trusted: Tensor) -> Tensor:
         """By what (1, 3, 3) it may be off at a ``pose`` (1, 3) if all that stands still is no part of it: a covariance
-        of as much as leaves what is left of the others in blocks that are ``trusted`` (1, blocks), and more than noise.
-        """
+        of as much as leaves what is left of the others in blocks that are ``trusted`` (1, blocks), and more than noise;
+        no more than it may have moved unseen."""
         seen, reference, axes = look(self, pose, self.reference), self.reference, turn(pose[:, 2])
         warps = reference.warps(torch.cat((pose, self.home)))
         now, home = (warps - shift(*seen.corner, warps)).split(1)
@@ -263,6 +265,8 @@ class Still(NamedTuple):
             return torch.zeros_like(axes)
         noise = left.quantile(QUIET).mul(TO_MEAN).clamp(max=seen.noise)  # the estimate is an upper one
         more = (left - noise).sum() - BY_CHANCE * noise * (2 * len(left)) ** 0.5
-        spread: Tensor = reweigh(reference, moving).normal.inverse[:, :3, :3] * more.clamp(min=0)
-        doubt: Tensor = axes @ (spread + spread.mT) @ axes.mT / 2
-        return doubt
+        normal = reweigh(reference, moving).normal
+        half = axes @ normal.inverse[:, :3, :3]
+        doubt: Tensor = half @ normal.meat @ half.mT * more.clamp(min=0)
+        most = largest_variance(reference.place.lever2, doubt)
+        return doubt * (UNSEEN**2 / most.clamp(min=UNSEEN**2)).view(-1, 1, 1)
