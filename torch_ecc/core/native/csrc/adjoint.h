@@ -62,17 +62,19 @@ template <class Body>
 void lines(const View& view, const Warp& there, Body body) {
   const float *const u = view.u, *const v = view.v;
   for (int64_t first = 0, last; first < view.pixels; first = last) {
-    for (last = first + 1; last < view.pixels && u[last] == u[last - 1] + 1 && v[last] == v[first];) ++last;
+    const auto on = [&](int64_t i) {  // they are in order, row by row
+      return i < view.pixels && v[i] == v[first] && u[i] - u[first] == float(i - first);
+    };
+    for (last = first + 1; on(last + LANES - 1);) last += LANES;
+    while (on(last)) ++last;
     const double x = there.x(u[first], v[first]), y = there.y(u[first], v[first]);
     body(first, Line{float(x), float(y), float(there.xu), float(there.yu), int(last - first)});
   }
 }
 
-struct Places {  // of a vector of points, each with taps of its own
-  int32_t at[LANES];
-};
+inline Vector clamped(const Vector& v, float most) { return v > most ? Vector{} + most : v > 0.f ? v : Vector{}; }
 
-// `runs` of any line: the body has `Places` where neighbours do not have neighbouring taps.
+// `runs` of any line: the body has a place for each where neighbours do not have neighbouring taps.
 template <int degree, class Body>
 void vectors(const Window& window, const Line& line, Body body) {
   if (straight(line)) return runs<degree>(window, line, body);
@@ -81,25 +83,32 @@ void vectors(const Window& window, const Line& line, Body body) {
   Vector lane;
   for (int k = 0; k < LANES; ++k) lane[k] = float(k);
   for (int i = 0; i < line.n; i += LANES, lane += float(LANES)) {
-    Places places;
-    Vector fx, fy;
-    for (int k = 0; k < LANES; ++k) {
-      const float x = std::clamp(line.x + float(i + k) * line.dx, 0.f, right);
-      const float y = std::clamp(line.y + float(i + k) * line.dy, 0.f, bottom);
-      const int32_t ix = int32_t(x), iy = int32_t(y);
-      fx[k] = x - float(ix), fy[k] = y - float(iy);
-      places.at[k] = iy * int32_t(window.pitch()) + ix;
-    }
-    body(places, i, line.n - i, fx, fy, lane);
+    const Vector x = clamped(line.x + lane * line.dx, right), y = clamped(line.y + lane * line.dy, bottom);
+    const Ints ix = __builtin_convertvector(x, Ints), iy = __builtin_convertvector(y, Ints);
+    const Vector fx = x - __builtin_convertvector(ix, Vector), fy = y - __builtin_convertvector(iy, Vector);
+    body(Ints(iy * int32_t(window.pitch()) + ix), i, line.n - i, fx, fy, lane);
   }
 }
 
-inline Vector tap(const float* values, int64_t at) { return load<Vector>(values + at); }
+template <int l>
+Vector tap(const float* from, int64_t at) {
+  return load<Vector>(from + at + l);
+}
 
-inline Vector tap(const float* values, const Places& places) {
+// Value l behind each place: of a transpose, whose steps but for the last are the same for all l.
+template <int l, int size = LANES>
+[[gnu::always_inline]] inline Vector tap(const float* from, const Ints& places) {
+#if defined(__clang__) || defined(__AVX__)
+  if constexpr (size == 1)
+    return load<Vector>(from + places[l]);
+  else
+    return after<l % 2 * LANES / 2, 2>(tap<l / 2, size / 2>(from, places),
+                                       tap<l / 2 + LANES / 2, size / 2>(from, places));
+#else  // g++ shuffles one by one
   float taps[LANES];
-  for (int k = 0; k < LANES; ++k) taps[k] = values[places.at[k]];
+  for (int k = 0; k < LANES; ++k) taps[k] = from[places[k] + l];
   return load<Vector>(taps);
+#endif
 }
 
 // Adds the products of wx and wy to the taps.
@@ -118,7 +127,7 @@ void add(float* values, int64_t pitch, int64_t at, int, const Vector (&wx)[degre
 }
 
 template <int degree>
-void add(float* values, int64_t pitch, const Places& places, int n, const Vector (&wx)[degree + 1],
+void add(float* values, int64_t pitch, const Ints& places, int n, const Vector (&wx)[degree + 1],
          const Vector (&wy)[degree + 1]) {
   constexpr int size = degree == 5 ? 8 : degree + 1;
   typedef float Taps __attribute__((vector_size(4 * size)));  // of a row
@@ -129,7 +138,7 @@ void add(float* values, int64_t pitch, const Places& places, int n, const Vector
     float weights[size] = {};
     for (int l = 0; l <= degree; ++l) weights[l] = wx[l][i];
     std::memcpy(&row, weights, sizeof row);
-    float* to = values + places.at[i];
+    float* to = values + places[i];
     for (int k = 0; k <= degree; ++k, to += pitch) {
       std::memcpy(&sum, to, sizeof sum);
       sum += wy[k][i] * row;
@@ -161,12 +170,12 @@ void linearise(const View& view, int64_t b) {
       weigh_slopes<degree, Vector>(fx, dx);
       weigh_slopes<degree, Vector>(fy, dy);
       for (int k = 0; k < taps; ++k) {
+        const float* const values = window.values.data() + k * window.pitch();
         Vector row{}, along{};
-        for (int l = 0; l < taps; ++l) {
-          const Vector value = tap(window.values.data() + k * window.pitch() + l, at);
-          row += wx[l] * value;
-          along += dx[l] * value;
-        }
+        [&]<int... l>(std::integer_sequence<int, l...>) {
+          const Vector value[] = {tap<l>(values, at)...};
+          ((row += wx[l] * value[l], along += dx[l] * value[l]), ...);
+        }(std::make_integer_sequence<int, taps>());
         sum[0] += wy[k] * row;
         sum[1] += wy[k] * along;
         sum[2] += dy[k] * row;

@@ -27,19 +27,19 @@ V load(const T* from) {
   return values;
 }
 
-// The values from the n-th of `a` on, continued by those of `b`.
-template <int n, int... k>
+// The values from the n-th of `a` on, continued by those of `b`; of `by` = 2 those of both by turns.
+template <int n, int by = 1, int... k>
 Vector after(const Vector& a, const Vector& b, std::integer_sequence<int, k...>) {
 #ifdef __clang__
-  return __builtin_shufflevector(a, b, (k + n)...);
+  return __builtin_shufflevector(a, b, (k / by + n + k % by * LANES)...);
 #else
-  return __builtin_shuffle(a, b, Ints{(k + n)...});
+  return __builtin_shuffle(a, b, Ints{(k / by + n + k % by * LANES)...});
 #endif
 }
 
-template <int n>
+template <int n, int by = 1>
 Vector after(const Vector& a, const Vector& b) {
-  return after<n>(a, b, std::make_integer_sequence<int, LANES>());
+  return after<n, by>(a, b, std::make_integer_sequence<int, LANES>());
 }
 
 inline void store(const Vector& values, float* to) { std::memcpy(to, &values, sizeof values); }
