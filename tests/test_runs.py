@@ -146,6 +146,22 @@ def test_stopped_twice_and_resumed(video, whole, tmp_path):
 
 
 @undrawn
+def test_marks_of_the_camera_are_resumed(video, tmp_path):
+    """Those that were found before, and which templates they concern."""
+    stack = np.load(video)
+    stack[:, :, 64:68] = 20
+    np.save(tmp_path / "striped.npy", stack)
+    striped, out = tmp_path / "striped.npy", tmp_path / "stopped"
+    session = Session(job(striped, tmp_path / "whole"))
+    session.run()
+    assert session.tracker.heed.any()
+    stop_at(striped, out, 40)
+    assert (out / "track.changes.part").is_file()
+    Session(job(striped, out, resume=True)).run()
+    assert_same(out, tmp_path / "whole")
+
+
+@undrawn
 def test_what_is_resumed_must_be_the_same_run(video, tmp_path):
     stop_at(video, tmp_path, 10)
     with pytest.raises(ValueError, match=r"resume: levels was 1 in the run in .*, and is 2 now"):

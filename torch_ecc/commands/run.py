@@ -25,7 +25,8 @@ from torch_ecc.track.tracker import Tracker
 
 Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 
-CONSTANT = ("template", "mask", "centre", "first", "marks", "heed", *LESSONS)  # of a state, or too large for a journal
+CONSTANT = ("template", "mask", "centre", "first", *LESSONS)  # of a state, or too large for a journal
+SELDOM = ("marks", "heed")  # does it change: too large to be in a journal with every frame
 
 
 class Run:
@@ -43,6 +44,8 @@ class Run:
         self._state = state_of(tracker)
         self._state += [] if self.body is None else list(self.body.buffers(recurse=False))
         self._views = [part.numpy() for part in self._state if part.device.type == "cpu"]  # they see what is written
+        self._seldom = [tracker.get_buffer(name) for name in SELDOM]
+        self._versions = [part._version for part in self._seldom]
         for film in films:
             film.film.resumable = True
         self._open = ExitStack()
@@ -83,10 +86,15 @@ class Run:
         """Append what was found in a frame to all files."""
         shown = estimate if self.body is None else drawn_with(self.body(estimate), estimate, self.body.lens)
         views = self._views or [part.cpu().numpy() for part in self._state]
-        self.track.write(estimate, frame, b"".join(view.tobytes() for view in views))
+        self.track.write(estimate, frame, b"".join(view.tobytes() for view in views), self._change())
         for film in self.films:
             film.write(frame, shown if isinstance(film, OverlayWriter) else estimate)
         self._count(*(code.cpu().numpy()[None] for code in (estimate.status, estimate.reason)))
+
+    def _change(self) -> bytes:
+        """What seldom changes, if it has."""
+        before, self._versions = self._versions, [part._version for part in self._seldom]
+        return b"" if before == self._versions else b"".join(part.cpu().numpy().tobytes() for part in self._seldom)
 
     @property
     def counts(self) -> tuple[int, int, NDArray[np.int64], NDArray[np.int8], NDArray[np.int64]]:
@@ -107,6 +115,10 @@ class Run:
         """After the frames that an unfinished run has left in ``folder``."""
         records = left.records(folder)
         restore(self._state, records["state"][-1].tobytes())
+        if change := left.change(folder):
+            restore(self._seldom, change)
+            self.tracker.load_state_dict(self.tracker.state_dict())  # to what follows from it
+            self._versions = [part._version for part in self._seldom]
         for film in self.films:
             pose, found = np.array(records["pose"]), records["status"] <= Status.MAX_ITERATIONS
             if self.body is not None and isinstance(film, OverlayWriter):  # the body, too, whose trail begins anew
@@ -118,7 +130,7 @@ class Run:
 
 def state_of(tracker: Tracker) -> list[Tensor]:
     """The parts of a tracker that change from frame to frame, in the order in which a journal has them."""
-    return [part for name, part in tracker.named_buffers() if name not in CONSTANT]
+    return [part for name, part in tracker.named_buffers() if name not in CONSTANT + SELDOM]
 
 
 def restore(parts: list[Tensor], state: bytes) -> None:

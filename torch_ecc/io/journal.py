@@ -1,6 +1,7 @@
-"""The two files of a run that is not finished: text rows, and one binary record per frame with the run's state.
+"""The files of a run that is not finished: text rows, one binary record per frame with the run's state, and one record
+for each time that what seldom changes of that state has done so.
 
-Both are appended to without a buffer, so that even a process that is killed leaves every frame but the one it was in.
+All are appended to without a buffer, so that even a process that is killed leaves every frame but the one it was in.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import FileIO
@@ -24,7 +26,8 @@ from torch_ecc.io.records import FIELDS
 from torch_ecc.io.summary import plain
 from torch_ecc.io.table import Table
 
-_RECORDS, _TABLE = "track.records", "track.csv"
+_RECORDS, _CHANGES, _TABLE = "track.records", "track.changes", "track.csv"
+_CHANGE = struct.Struct("<qq")  # of how many frames a change is the last, and of how many bytes
 _HEADER = 8  # digits of the length of what the records begin with
 _BLOCK = 1 << 22  # bytes of records that are read at once
 
@@ -95,6 +98,18 @@ class Unfinished(NamedTuple):
             for index in range(first, self.frames, most):
                 yield np.fromfile(file, dtype, min(most, self.frames - index))
 
+    def change(self, folder: Path) -> bytes | None:
+        """What seldom changes, as it was last; None if it never has. One that was cut off is of no whole frame."""
+        path, last = part(folder, _CHANGES), None
+        if not path.is_file() or path.is_symlink():
+            return None
+        with path.open("rb") as file:
+            while len(head := file.read(_CHANGE.size)) == _CHANGE.size:
+                frames, size = _CHANGE.unpack(head)
+                change = file.read(size)
+                last = change if frames <= self.frames else last
+        return last
+
 
 @dataclass
 class Journal:
@@ -119,6 +134,7 @@ class Journal:
         told = json.dumps({"form": form, "layout": str(form.dtype), "settings": plain(settings)}).encode()
         header, title = b"%0*d" % (_HEADER, len(told)) + told, form.table.header.encode()
         table, records = create(part(folder, _TABLE)), create(part(folder, _RECORDS))
+        part(folder, _CHANGES).unlink(missing_ok=True)
         append(records, header)
         append(table, title)
         return Journal(folder, form, len(header), table, records, len(title))
@@ -158,6 +174,12 @@ class Journal:
         # A frame counts from here on: what an interrupt leaves half-written behind these marks is cut off by close().
         self.frames, self.table_bytes = self.frames + 1, self.table_bytes + len(text)
 
+    def keep(self, change: bytes) -> None:
+        """What seldom changes, as it is from the next frame on."""
+        path = part(self.folder, _CHANGES)
+        with reopen(path, path.stat().st_size) if path.exists() else create(path) as file:
+            append(file, _CHANGE.pack(self.frames + 1, len(change)) + change)
+
     def extend(self, records: NDArray[Any], rows: bytes) -> None:
         """Frames more, as another journal of this form has them."""
         append(self.records_file, records.tobytes())
@@ -181,6 +203,7 @@ class Journal:
     def remove(self) -> None:
         """The results are whole: nobody needs to go on."""
         part(self.folder, _RECORDS).unlink()
+        part(self.folder, _CHANGES).unlink(missing_ok=True)
 
 
 def rows_file(folder: Path) -> Path:

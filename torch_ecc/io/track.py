@@ -84,9 +84,10 @@ class TrackWriter:
         """How many frames have been written."""
         return self._journal.frames if self._journal else 0
 
-    def write(self, record: Record, frame: Frame | None = None, state: bytes = b"") -> None:
+    def write(self, record: Record, frame: Frame | None = None, state: bytes = b"", change: bytes = b"") -> None:
         """Append one frame of R templates, the same R each time. ``frame`` brings its number, time, name and damage;
-        ``state``, of one length, is what a run needs to go on from here. ValueError for what does not fit."""
+        ``state``, of one length, is what a run needs to go on from here, with the ``change`` of what seldom changes,
+        empty where it has not. ValueError for what does not fit."""
         if frame is None:
             frame = Frame(self.frames, None, None if self.fps is None else self.frames / self.fps)
         arrays = to_arrays(record)
@@ -101,6 +102,8 @@ class TrackWriter:
             timed, micrometres = frame.time_s is not None, "displacement_um" in arrays
             form = Form(len(status), timed, bool(frame.name), micrometres, len(state))
             self._journal = Journal.begin(self.out_dir, form, self.settings)
+        if change:
+            self._journal.keep(change)
         self._journal.append(arrays, (status, reason, origin), frame, state)
 
     def __enter__(self) -> Self:
