@@ -488,6 +488,16 @@ def test_a_jpeg_in_a_video_that_claims_another_size_is_damaged(tmp_path):
     assert second.damage
 
 
+def test_motion_jpeg_that_ends_after_its_header_is_refused(tmp_path):
+    """Whatever a camera's program had written when it died."""
+    data = cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes()
+    write_jpegs(tmp_path / "v.avi", [data] * 3)
+    whole = (tmp_path / "v.avi").read_bytes()
+    (tmp_path / "v.avi").write_bytes(whole[: whole.index(b"movi") + 4])
+    with pytest.raises(ValueError, match=r"v\.avi holds no frame that can be read"):
+        list(open_frames(tmp_path / "v.avi"))
+
+
 def test_motion_jpeg_without_a_luma_plane_is_left_to_ffmpeg(tmp_path):
     colours = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
     Image.fromarray(colours).save(tmp_path / "f.jpg", keep_rgb=True)

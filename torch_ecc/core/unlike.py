@@ -28,11 +28,9 @@ def unlike(reference: Reference, found: Solution, score: Tensor, clings: Clingin
     It clings together along rows of blocks and along columns. The lines of a sensor do along one of them.
     """
     scatter, ratio, _ = clings
-    if (
-        scatter is None
-        or ratio is None
-        or (is_cpu(score.device) and none_at_all(score.tolist(), scatter[:, 0].tolist()))
-    ):
+    if scatter is None or ratio is None:
+        return None
+    if is_cpu(score.device) and none_at_all(score.tolist(), scatter[:, 0].tolist()):
         return None
     normal, power = found.normal, found.gain.square()
     left = found.total[:, 6] / (power * normal.total).clamp(min=LEAST) - LEAST_UNLIKE * normal.contrast

@@ -89,8 +89,8 @@ def _declared(container: Any, stream: Any) -> int:
 def _plain_size(path: Path) -> tuple[int, int] | None:
     """Width and height of frames of motion JPEG that libjpeg reads as FFmpeg does, None of all others."""
     with _opened(path, {}) as (container, stream), suppress(av.FFmpegError):
-        if stream.codec_context.name == "mjpeg":
-            packet = next(packet for packet in container.demux(stream) if packet.size)
+        packets = container.demux(stream) if stream.codec_context.name == "mjpeg" else ()
+        for packet in packets:
             for frame in packet.decode():
                 return (frame.width, frame.height) if is_plain(packet, frame) else None
     return None
