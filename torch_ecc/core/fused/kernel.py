@@ -59,9 +59,16 @@ def solve(frames, smooth, fine, coarse, trusted, start, bend, answers, way):
         state, well, bend, look = beginning(start + 3 * k), b >= 0, bend + 4 * k, answers.looks + b * OF_LOOK
         enough, some = tl.maximum(way.tolerance, COARSE_TOLERANCE), tl.maximum(way.most * 2 // 3, 1)
         if (way.COARSER or smooth.DEGREE > 1) and way.most > 1:
-            there = Pixels(first, coarse, trusted)
             state, well = iterate(
-                View(frames.grey + k * frames.next, frames), there, state, well, bend, look, enough, some, way
+                View(frames.grey + k * frames.next, frames),
+                Pixels(first, coarse, trusted),
+                state,
+                well,
+                bend,
+                look,
+                enough,
+                some,
+                way,
             )
         state, well = iterate(
             View(smooth.grey + k * smooth.next, smooth),
