@@ -27,10 +27,11 @@ def page(
     reference: Reference, image: Tensor, start: Tensor, settings: Settings, blocks: Tensor | None = None
 ) -> Solution:
     """The page's answer for each template by itself."""
+    which = torch.arange(len(start), device=start.device)
     views = [image if len(image) == 1 else image[k : k + 1] for k in range(len(start))]
-    trust = [None if blocks is None else Trust(torch.tensor([0]), blocks[k : k + 1]) for k in range(len(start))]
+    trust = [None if blocks is None else Trust(which[:1], blocks[k : k + 1]) for k in range(len(start))]
     parts = [
-        solver.solve(reference.select(torch.tensor([k])), view, start[k : k + 1], settings, trust[k])
+        solver.solve(reference.select(which[k : k + 1]), view, start[k : k + 1], settings, trust[k])
         for k, view in enumerate(views)
     ]
     return each(lambda *values: torch.cat(values), *parts)
@@ -53,10 +54,10 @@ def ill_posed(
     """Templates (B,) whose ``answer`` by the page is another one when image and start move by next to nothing: along an
     edge, or in another scene, rounding grows from step to step, and a pixel may be on either side of the border."""
     draw = torch.Generator().manual_seed(0)
-    changed = torch.zeros(len(start), dtype=torch.bool)
+    changed = torch.zeros_like(start[:, 0], dtype=torch.bool)
     for size in (-1.0, 1.0, -3.0, 3.0):
-        noise = 3e-4 * size * image.float().std() * torch.randn(image.shape, generator=draw)
-        there = page(reference, image.float() + noise, start + size * NUDGE, settings, blocks)
+        noise = 3e-4 * size * image.float().std() * torch.randn(image.shape, generator=draw).to(image.device)
+        there = page(reference, image.float() + noise, start + size * NUDGE.to(start.device), settings, blocks)
         nudged = judge(reference, there, start, settings)
         changed |= differs(nudged, answer)
     return changed
@@ -72,14 +73,14 @@ def bent(reference: Reference, seed: int) -> Reference:
     """The templates seen with a distortion of some percent in every third problem."""
     draw = torch.Generator().manual_seed(seed)
     distortion = 0.04 * torch.rand(len(reference.K), 2, 2, generator=draw, dtype=torch.float64) - 0.02
-    return reference.distorted(distortion) if seed % 3 == 0 else reference
+    return reference.distorted(distortion.to(reference.K.device)) if seed % 3 == 0 else reference
 
 
 def trusted(reference: Reference, seed: int) -> Tensor:
     """Trust (B, blocks) in each block of templates: whole, none, or anything between."""
     draw = torch.Generator().manual_seed(seed)
     value = torch.rand(reference.blocks.weight.shape, generator=draw)
-    return (3 * value - 0.5).clamp(0, 1)
+    return (3 * value - 0.5).clamp(0, 1).to(reference.K.device)
 
 
 @engines

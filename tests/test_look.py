@@ -70,6 +70,7 @@ def test_it_waits_for_nothing(blind, options):
     first, second = frames(2)
     follow = tracker(first, **options)
     image = second[None]
+    follow._look.made(image, [image])  # constants are made
     with NoWaiting():
         start, estimate, _ = follow._look.made(image, [image])
     assert start.shape == (2, 3)

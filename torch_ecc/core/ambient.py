@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import lru_cache, wraps
+from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
 import torch
@@ -96,9 +96,9 @@ def repeated(body: Callable[..., tuple[Tensor, ...]], values: tuple[Tensor, ...]
 
 
 def constant(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """``lasting``, made once for the same arguments, of which there are few; part of the graph that torch.compile
-    makes."""
-    cached: Callable[..., Result] = lru_cache(maxsize=64)(lasting(function))
+    """``lasting``, made once for the same arguments, of which there are few, and for good: a CUDA graph reads it where
+    it was; part of the graph that torch.compile makes."""
+    cached: Callable[..., Result] = cache(lasting(function))
 
     @wraps(function)
     def made(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

@@ -80,8 +80,7 @@ def scale_of(grid: Grid, normal: Normal) -> Tensor | None:
     if occupied < FEW_BLOCKS * columns:
         return None
     free = occupied / (occupied - columns)  # blocks are not free: the fit has made their sum zero
-    sure, _ = _shares(grid.blocks, normal.white.dtype, normal.white.device)
-    return (normal.white.new_tensor([[free], [1], [1]]) / (sure * normal.white[:, None])).flatten(1)
+    return (_scales(grid.blocks, free, normal.white.dtype, normal.white.device) / normal.white[:, None]).flatten(1)
 
 
 def explained(residuals: Residuals, grid: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
@@ -106,6 +105,12 @@ def strains(reference: Reference, found: Solution) -> Strains:
         return reference.strains
     share = found.sums[:, 0] / reference.parts.weight.clamp(min=LEAST)
     return strains_of(reference.parts, found.normal, share if found.trust is None else share * found.trust)
+
+
+@constant
+def _scales(grid: tuple[int, int], free: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """What makes the scatter (3, 1) of blocks, and of rows and columns of them, that which is so for certain."""
+    return torch.tensor([[free], [1], [1]], dtype=dtype, device=device) / _shares(grid, dtype, device)[0]
 
 
 @constant

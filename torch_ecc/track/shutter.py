@@ -19,6 +19,7 @@ from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.pose import rotation, turn
@@ -33,7 +34,7 @@ LARGEST = 0.5  # of |s v|: a target that moves on by half of what is read out is
 NEWEST = 0.3  # of the mean square of what a degree adds is this frame's
 LEAST_NOISE = 2e-3  # px of a pose: what no noise model knows, as the sampler's own errors
 FALLS = 0.5  # by so much its square falls, at least, from one degree to a next one that nobody knows
-STRETCHES, BENDS = [0, 1, 2], [3, 4]  # of blocks.STRAINS
+STRETCHES, BENDS = slice(0, 3), slice(3, 5)  # of blocks.STRAINS
 
 State = Mapping[str, Tensor]
 
@@ -140,8 +141,7 @@ class Shutter(NamedTuple):
         shift = (turn(theta) @ inverse @ bends @ size[:, :, None])[:, :, 0] + motion.acceleration * self.bent(radius)[
             :, None
         ]
-        shift = shift * theta.new_tensor((1.0, 1.0, 0.0))
-        shift = torch.where(Status.good(estimate.status)[:, None], shift, 0.0)
+        shift = torch.where(Status.good(estimate.status)[:, None], pad(shift[:, :2], (0, 1)), 0.0)
         return estimate._replace(pose=estimate.pose - shift, displacement=estimate.displacement - shift)
 
     def distortion(self, pose: Tensor, state: State) -> Tensor | None:
