@@ -70,11 +70,12 @@ def test_it_waits_for_nothing(blind, options):
     first, second = frames(2)
     follow = tracker(first, **options)
     image = second[None]
-    follow._look.made(image, [image])  # constants are made
-    with NoWaiting():
-        start, estimate, _ = follow._look.made(image, [image])
-    assert start.shape == (2, 3)
-    assert te.Status.good(estimate.status).all()
+    for put_off in (False, True):
+        follow._look.made(image, [image], put_off)  # constants are made
+        with NoWaiting():
+            start, estimate, *_ = follow._look.made(image, [image], put_off)
+        assert start.shape == (2, 3)
+        assert te.Status.good(estimate.status).all()
 
 
 def test_what_was_recorded_serves_all_frames(request):
@@ -86,7 +87,7 @@ def test_what_was_recorded_serves_all_frames(request):
     request.getfixturevalue("_graphs")
     follow = tracker(first)
     found = [follow.track(frame) for frame in others]
-    assert follow._look.graph is not None
+    assert follow._look.graphs
     for a, b in zip(found, wanted, strict=True):
         assert torch.equal(a.status, b.status)
         assert (a.pose - b.pose).abs().max() < 1e-9
@@ -103,14 +104,14 @@ def test_it_is_recorded_again_for_what_it_does_not_fit(monkeypatch):
     first, second, third, _ = frames()
     follow = tracker(first)
     follow.track(second)
-    graph = follow._look.graph
+    graph = follow._look.graphs[True]
     other = copy.deepcopy(follow)
-    assert other._look.graph is None
+    assert not other._look.graphs
     found = follow.track(third.float())
-    assert follow._look.graph is not graph
+    assert follow._look.graphs[True] is not graph
     assert (found.pose - other.track(third).pose).abs().max() < 1e-4
     follow.load_state_dict(other.state_dict())
-    assert follow._look.graph is None
+    assert not follow._look.graphs
 
 
 @pytest.mark.usefixtures("_graphs")
@@ -120,7 +121,7 @@ def test_gradients_are_not_recorded():
     frame = second.float().requires_grad_()
     follow.track(frame).pose.sum().backward()
     assert frame.grad.abs().max() > 0
-    assert follow._look.graph is None
+    assert not follow._look.graphs
 
 
 @pytest.mark.parametrize(("found", "at"), [(weakest, 0), (strongest, 2)])

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.pose import retract, turn
 from torch_ecc.core.reference import Reference
+from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust
 
@@ -46,7 +47,8 @@ class Push(NamedTuple):
 
     def __call__(self, found: Solution, asked: Tensor) -> Tensor:
         """What is left, over what may be, of those that are ``asked`` (B,) bool, 0 of the others."""
-        share = left_of_push(self.engine(), self.reference, self.image, self.settings, found) / MOST_LEFT
+        trust = trusted(found, asked)
+        share = left_of_push(self.engine(), self.reference, self.image, self.settings, found, trust) / MOST_LEFT
         if self.answered is not None:
             count = torch.where(share < CLEARLY, self.answered + 1, 0)
             self.answered.copy_(torch.where(asked, count, self.answered))
@@ -54,24 +56,29 @@ class Push(NamedTuple):
 
 
 @torch.no_grad()
-def left_of_push(engine: Engine, reference: Reference, image: Tensor, settings: Settings, found: Solution) -> Tensor:
-    """The share (B,) of a push that one iteration of the ``engine`` leaves of templates that were ``found``, in the
-    direction in which their texture is most like noise: of texture next to none, of noise all of it. Of a blurred
-    picture it leaves something in every direction: what counts is how much more in that one than in any."""
+def left_of_push(
+    engine: Engine, reference: Reference, image: Tensor, settings: Settings, found: Solution, trust: Trust | None = None
+) -> Tensor:
+    """The share (B,) of a push that one iteration of the ``engine`` leaves of templates that were ``found`` and are
+    solved with a ``trust``, in the direction in which their texture is most like noise: of texture next to none, of
+    noise all of it. Of a blurred picture it leaves something in every direction: what counts is how much more in that
+    one than in any."""
     image, found = image.detach(), found._replace(pose=found.pose.detach())
     least, most = by_information(found.normal)
-    weak, strong = (answer(engine, reference, image, settings, found, way) for way in (least, most))
+
+    def again(start: Tensor) -> Solution:
+        return engine(reference, image, start, settings.once, trust)
+
+    weak, strong = (answer(again, reference, found, way) for way in (least, most))
     return 1 - weak / strong.clamp(LEAST_ANSWER, 1.0)
 
 
-def answer(
-    engine: Engine, reference: Reference, image: Tensor, settings: Settings, found: Solution, direction: Tensor
-) -> Tensor:
-    """The share (B,) of a push in a ``direction`` (B, 3) that is taken back."""
+def answer(solve: Callable[[Tensor], Solution], reference: Reference, found: Solution, direction: Tensor) -> Tensor:
+    """The share (B,) of a push in a ``direction`` (B, 3) that is taken back by those who ``solve`` from a start on."""
     axes = turn(found.pose[:, 2])
     push = direction * (PUSH / torch.linalg.vector_norm(direction * reference.place.lever, dim=1, keepdim=True))
     starts = (retract(found.pose, away) for away in (push, -push))
-    before, after = (engine(reference, image, start, settings.once, trusted(found)).pose for start in starts)
+    before, after = (solve(start).pose for start in starts)
     apart = (axes.mT @ (after - before)[:, :, None])[:, :, 0]
     power = found.normal.bread_bias.diagonal(dim1=1, dim2=2)
     share: Tensor = (apart * power * push).sum(1) / (2 * (push * power * push).sum(1)).clamp(min=LEAST)
@@ -110,8 +117,8 @@ def trace(matrix: Tensor) -> Tensor:
     return matrix.diagonal(dim1=1, dim2=2).sum(1).clamp(min=LEAST)[:, None, None]
 
 
-def trusted(found: Solution) -> Trust | None:
-    """As it was solved with."""
-    if found.trust is None:
+def trusted(found: Solution, asked: Tensor) -> Trust | None:
+    """As it was solved with, in those that are ``asked`` (B,)."""
+    if found.trust is None and is_cpu(asked.device):
         return None
-    return Trust(torch.arange(len(found.trust), device=found.trust.device), found.trust)
+    return Trust(torch.arange(len(asked), device=asked.device), found.trust, asked)

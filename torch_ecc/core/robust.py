@@ -54,11 +54,13 @@ class Scale(NamedTuple):
 
 class Memory(NamedTuple):
     """What is known of B templates from the frames before: their usual ``score`` (B,), and the ``trust`` (B, blocks)
-    that there was in them in the last one; and in how many they ``answered`` (B,) a push, see ``pushed``."""
+    that there was in them in the last one; and in how many they ``answered`` (B,) a push, see ``pushed``.
+    ``put_off``: templates that are in doubt are only named, not solved again."""
 
     score: Tensor
     trust: Tensor
     answered: Tensor
+    put_off: bool = False
 
     @staticmethod
     def none(reference: Reference) -> Memory:
@@ -66,10 +68,15 @@ class Memory(NamedTuple):
         score = expected_score(reference)
         return Memory(score, torch.ones_like(reference.blocks.weight), torch.zeros_like(score, dtype=torch.long))
 
+    def kept(self) -> dict[str, Tensor]:
+        """What lasts from one frame to the next."""
+        return {"score": self.score, "trust": self.trust, "answered": self.answered}
+
 
 class Doubted(NamedTuple):
     """Templates at ``which`` (n,) of a solve by an ``engine`` that are solved again: what they have in their blocks,
-    the ``floor`` (n, 1) of the noise's variance, their ``usual`` (n,) score and the ``last`` (n, blocks) trust."""
+    the ``floor`` (n, 1) of the noise's variance, their ``usual`` (n,) score and the ``last`` (n, blocks) trust; which
+    are ``asked`` (n,) for, None if all are."""
 
     engine: Engine
     reference: Reference
@@ -80,6 +87,7 @@ class Doubted(NamedTuple):
     floor: Tensor
     usual: Tensor
     last: Tensor
+    asked: Tensor | None = None
 
     @staticmethod
     def of(engine: Engine, reference: Reference, image: Tensor, settings: Settings, memory: Memory) -> Doubted:
@@ -96,7 +104,7 @@ class Doubted(NamedTuple):
 
     def solve(self, start: Tensor, settings: Settings, trusted: Tensor) -> Solution:
         """From ``start`` (B, 3) on, with blocks (n, blocks) as they are trusted."""
-        return self.engine(self.reference, self.image, start, settings, Trust(self.which, trusted))
+        return self.engine(self.reference, self.image, start, settings, Trust(self.which, trusted, self.asked))
 
 
 def solve(
@@ -120,12 +128,14 @@ def solve(
         doubted, plain = doubted.at(odd), part_of(plain, odd)
     uneven = has_outliers(doubted, plain)
     doubtful = uneven | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
+    if memory.put_off:
+        return found._replace(odd=odd, doubtful=doubtful)
     if on_cpu:
         if not doubtful.any():
             return found._replace(odd=odd)
         doubted, plain, uneven = doubted.at(doubtful), part_of(plain, doubtful), uneven[doubtful]
         doubtful = doubtful[doubtful]
-    again = solved_again(doubted, start, plain, uneven)
+    again = solved_again(doubted if on_cpu else doubted._replace(asked=doubtful), start, plain, uneven)
     answer = chosen(doubtful, again, plain)
     answer = each(lambda old, new: old.index_copy(0, doubted.which, new), found._replace(trust=whole(found)), answer)
     return answer._replace(odd=odd)

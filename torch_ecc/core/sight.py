@@ -117,7 +117,8 @@ def trusted(which: Tensor, clear: Tensor, trust: Trust | None) -> Trust | None:
     if the host knows that it is whole."""
     if trust is None and is_cpu(clear.device) and bool(clear.all()):
         return None
-    return Trust(which, clear.float() if trust is None else trust.blocks * clear)
+    blocks, asked = (None, None) if trust is None else (trust.blocks, trust.asked)
+    return Trust(which, clear.float() if blocks is None else blocks * clear, asked)
 
 
 def without(found: Solution, clear: Tensor) -> Solution:

@@ -19,11 +19,18 @@ FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 
 
 class Trust(NamedTuple):
-    """Of the templates at ``which`` (n,): by how much the pixels of their ``blocks`` (n, blocks) count, 0 to 1. Where
-    the host does not look that is all of them, in their order."""
+    """Of the templates at ``which`` (n,): by how much the pixels of their ``blocks`` (n, blocks) count, 0 to 1, None if
+    all do. Where the host does not look that is all of them, in their order; what is answered of those that are not
+    ``asked`` (n,) for, by default all, means nothing."""
 
     which: Tensor
-    blocks: Tensor
+    blocks: Tensor | None
+    asked: Tensor | None = None
+
+    @staticmethod
+    def whole(trust: Trust | None) -> bool:
+        """Whether all pixels count."""
+        return trust is None or trust.blocks is None
 
 
 class Solution(NamedTuple):
@@ -32,7 +39,8 @@ class Solution(NamedTuple):
     every block of pixels the rows of ``summed``, their ``total`` (B, 10 + 9) over the blocks, as they are trusted, with
     what the last three have in ``clustered``, and the ``normal`` equations of the pixels that count: in sight, and as
     their blocks are trusted. A gain or total not finite is 0. ``trust`` (B, blocks) in these, None if it is whole;
-    ``odd`` (B,): which have blocks with more left than any noise leaves, None if it is known that none has."""
+    ``odd`` (B,): which have blocks with more left than any noise leaves, None if it is known that none has;
+    ``doubtful`` (B,): which must be solved again, None if all that must be are."""
 
     pose: Tensor
     error: Tensor
@@ -43,6 +51,7 @@ class Solution(NamedTuple):
     normal: Normal
     trust: Tensor | None = None
     odd: Tensor | None = None
+    doubtful: Tensor | None = None
 
 
 Engine = Callable[[Reference, Tensor, Tensor, Settings, Trust | None], Solution]  # ``solver.solve``, ``native.solve``

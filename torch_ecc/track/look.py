@@ -2,7 +2,8 @@
 
 Nothing in a look depends on the host (``sampling.is_cpu``), and the state keeps its place in memory. So what the GPU
 was asked to do in one frame it can do again in all others, at once, where the host would ask for some hundred things
-one after the other.
+one after the other. What is done again where blocks do not fit is three times as much: it is a graph of its own, for
+those frames in which the host sees that some template needs it.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from torch_ecc.track.shutter import Shutter
 
 WARM = 3  # looks before the one that is recorded: constants are made, kernels compiled and loaded
 
-# Start (R, 3), what was found, and which (R,) have blocks with more left than any noise leaves, None if none has.
-Result = tuple[Tensor, Estimate, Tensor | None]
+# Start (R, 3), what was found, which (R,) have blocks with more left than any noise leaves, None if none has, and which
+# must be solved again, None if all are that must be.
+Result = tuple[Tensor, Estimate, Tensor | None, Tensor | None]
 
 
 @dataclass
@@ -42,25 +44,35 @@ class Look:
     state: State
     moving: bool
     shown: Tensor | None
-    graph: Graph | None = field(default=None, init=False)
+    graphs: dict[bool, Graph] = field(default_factory=dict, init=False)  # one, and another for what was put off
 
-    def __call__(self, image: Tensor, images: list[Tensor]) -> Result:
+    def __call__(self, image: Tensor, images: list[Tensor]) -> tuple[Tensor, Estimate, Tensor | None]:
         """At an ``image`` (1 or R, 1, H, W), as ``core.frame.as_image`` has it; ``images`` holds it without gradients
         and grows to as many levels as there are."""
         if len(self.references) > 1 or not self.recordable(image):
-            return self.made(image, images)
-        if self.graph is None or not self.graph.fits(image):
-            self.graph = Graph(
-                lambda frame: self.made(frame, [frame]), image, [self.state["trust"], self.state["answered"]]
-            )
-        return self.graph(image)
+            return self.made(image, images)[:3]
+        kept = [self.state["trust"], self.state["answered"]]
+        before = [part.clone() for part in kept]
+        result = self.graph(image, put_off=self.shutter.line == 0)(image)
+        if result[3] is not None and bool(result[3].any()):
+            for part, was in zip(kept, before, strict=True):
+                part.copy_(was)
+            result = self.graph(image, put_off=False)(image)
+        return result[:3]
+
+    def graph(self, image: Tensor, put_off: bool) -> Graph:
+        """That for frames like an ``image``."""
+        if put_off not in self.graphs or not self.graphs[put_off].fits(image):
+            kept = [self.state["trust"], self.state["answered"]]
+            self.graphs[put_off] = Graph(lambda frame: self.made(frame, [frame], put_off), image, kept)
+        return self.graphs[put_off]
 
     def recordable(self, image: Tensor) -> bool:
         """Whether there are CUDA graphs where it is, and nobody asks for more than values."""
         wanted = implicit.wanted(self.references[0], image, self.state["pose"])
         return has_graphs(image.device) and not wanted and not torch.compiler.is_compiling()
 
-    def made(self, image: Tensor, images: list[Tensor]) -> Result:
+    def made(self, image: Tensor, images: list[Tensor], put_off: bool = False) -> Result:
         """Coarse to fine."""
         pose = self.state["pose"]
         start = there = ahead(pose, self.state["velocity"]) if self.moving else pose
@@ -68,9 +80,9 @@ class Look:
             image = filled(image.float(), self.shown)
             images[:] = image_pyramid(image.detach(), len(self.references))
             there = coarse_to_fine(self.references, images, start, self.settings.max_iterations)
-        look = Remembering(self.state, image, self.settings)
+        look = Remembering(self.state, image, self.settings, put_off)
         estimate = self.shutter.solve(look, self.references[0], there, self.state, self.settings.tolerance)
-        return start, estimate, look.odd
+        return start, estimate, look.odd, look.doubtful
 
 
 def has_graphs(device: torch.device) -> bool:
@@ -98,8 +110,9 @@ class Graph:
         with torch.no_grad():
             self.image.copy_(image, non_blocking=True)
             self.repeat()
-            start, estimate, odd = self.result
-            return start.clone(), each(torch.clone, estimate), None if odd is None else odd.clone()
+            start, estimate, *which = self.result
+            odd, doubtful = (None if some is None else some.clone() for some in which)
+            return start.clone(), each(torch.clone, estimate), odd, doubtful
 
 
 def recorded(work: Callable[[], Result], device: torch.device) -> tuple[Callable[[], None], Result]:

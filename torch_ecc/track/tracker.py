@@ -149,7 +149,7 @@ class Tracker(nn.Module):
         for name, value in {**templates._asdict(), "first": first, **beginning(start), **past}.items():
             self.register_buffer(name, value)
         self._use(self._prepared(self._buffers))
-        for name, value in Memory.none(self.references[0])._asdict().items():
+        for name, value in Memory.none(self.references[0]).kept().items():
             self.register_buffer(name, value)  # score (R,), the usual one, and trust (R, blocks)
         if self.learns:
             for name, value in Lessons.begin(self.template, self.references[0].noise.level, start).items():

@@ -68,7 +68,8 @@ def solve(
     else:
         found = call(image, start, reference.packed, how, trust, reference.distortion)
     pose, error, iterations, gain, sums, total, moments = found
-    return Solution(pose, error, iterations, gain, sums, total, _counted(reference, moments, trust))
+    partial = None if Trust.whole(trust) else trust
+    return Solution(pose, error, iterations, gain, sums, total, _counted(reference, moments, partial))
 
 
 def _counted(reference: Reference, moments: Tensor, trust: Trust | None) -> Normal:

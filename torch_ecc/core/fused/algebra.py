@@ -7,6 +7,8 @@ import triton.language as tl
 
 from torch_ecc.core.fused.records import INFINITE
 
+AT_ONCE = tl.constexpr(4)  # rows of a matrix of sums
+
 
 @triton.jit
 def picked(vector, k):
@@ -33,18 +35,47 @@ def finite(v):
 
 
 @triton.jit
-def stacked(columns, COUNT: tl.constexpr, SLICE: tl.constexpr):
-    """Columns (SLICE,) as a matrix (16, SLICE)."""
-    k, matrix = tl.arange(0, 16)[:, None], tl.zeros((16, SLICE), tl.float32)
-    for j in tl.static_range(COUNT):
-        matrix = tl.where(k == j, columns[j][None, :], matrix)
-    return matrix
+def scaled(columns, weight, COUNT: tl.constexpr):
+    """Columns (PIXELS,) times a weight."""
+    result = ()
+    for k in tl.static_range(COUNT):
+        result = result + (columns[k] * weight,)
+    return result
 
 
 @triton.jit
-def product(a, b):
-    """A B^T (16, 16) of matrices (16, SLICE), in full float32."""
-    return tl.dot(a, tl.trans(b), input_precision="ieee")
+def nothing(FIRST: tl.constexpr, HEIGHT: tl.constexpr, WIDTH: tl.constexpr, PIXELS: tl.constexpr):
+    """No products yet, see there."""
+    sums = ()
+    for i in tl.static_range(AT_ONCE):
+        if FIRST + i < HEIGHT:
+            for _ in tl.static_range(WIDTH):
+                sums = sums + (tl.zeros((PIXELS,), tl.float32),)
+    return sums
+
+
+@triton.jit
+def with_products(sums, left, right, FIRST: tl.constexpr, HEIGHT: tl.constexpr, WIDTH: tl.constexpr):
+    """The ``sums`` and, pixel by pixel, the products of AT_ONCE of HEIGHT columns on the left, from FIRST on, with
+    WIDTH on the right: those rows of a matrix, of which all are more than registers hold."""
+    result = ()
+    for i in tl.static_range(AT_ONCE):
+        if FIRST + i < HEIGHT:
+            for j in tl.static_range(WIDTH):
+                result = result + (sums[i * WIDTH + j] + left[FIRST + i] * right[j],)
+    return result
+
+
+@triton.jit
+def placed_in(matrix, sums, FIRST: tl.constexpr, HEIGHT: tl.constexpr, WIDTH: tl.constexpr):
+    """A matrix (16, 16), float64, with those rows, added up."""
+    row, column = tl.arange(0, 16)[:, None], tl.arange(0, 16)[None, :]
+    for i in tl.static_range(AT_ONCE):
+        if FIRST + i < HEIGHT:
+            for j in tl.static_range(WIDTH):
+                value = tl.sum(sums[i * WIDTH + j]).to(tl.float64)
+                matrix = tl.where((row == FIRST + i) & (column == j), value, matrix)
+    return matrix
 
 
 @triton.jit

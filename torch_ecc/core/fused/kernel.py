@@ -11,7 +11,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from torch_ecc.core.fused.algebra import column_of, inverted, picked, product, stacked
+from torch_ecc.core.fused.algebra import AT_ONCE, column_of, inverted, nothing, picked, placed_in, scaled, with_products
 from torch_ecc.core.fused.patch import (
     columns,
     counted,
@@ -43,17 +43,18 @@ from torch_ecc.core.fused.records import (
 
 @triton.jit
 def solve(frames, smooth, fine, coarse, trusted, start, bend, answers, way):
-    """Program b: the template b, or the b-th of those that trust is about. First without ``PARTIAL``, for those that
-    stay in sight and are trusted, of whose moments the first is then -1; with it for the others.
+    """Program b: the template b, or the b-th of those that trust is about, if it is asked for. First without
+    ``PARTIAL``, for those that stay in sight and are trusted, of whose moments the first is then -1; with it for the
+    others.
 
     A record with constants is an argument, never the value of a variable: that would make numbers of them.
     """
     b = tl.program_id(0).to(tl.int64)
-    k, left = b, b >= 0
+    k, left = b, tl.load(trusted.asked + b).to(tl.int32) != 0
     if trusted.SOME:
         k = tl.load(trusted.which + b)
     elif way.PARTIAL:
-        left = tl.load(answers.moments + b * OF_MOMENTS) >= 0
+        left = left & (tl.load(answers.moments + b * OF_MOMENTS) >= 0)
     if left:
         first, last = one_of(coarse, trusted, k, b), one_of(fine, trusted, k, b)
         state, well, bend, look = beginning(start + 3 * k), b >= 0, bend + 4 * k, answers.looks + b * OF_LOOK
@@ -81,13 +82,19 @@ def solve(frames, smooth, fine, coarse, trusted, start, bend, answers, way):
             way.most,
             way,
         )
-        tl.store(answers.pose + 3 * b, state.x)
-        tl.store(answers.pose + 3 * b + 1, state.y)
-        tl.store(answers.pose + 3 * b + 2, state.theta)
-        tl.store(answers.error + b, state.error)
-        tl.store(answers.iterations + b, state.iterations)
+        kept(answers, b, state)
         if not way.PARTIAL:
             tl.store(answers.moments + b * OF_MOMENTS, tl.where(well, -1.0, 0.0))
+
+
+@triton.jit
+def kept(answers, b, state):
+    """Where the b-th has come to."""
+    tl.store(answers.pose + 3 * b, state.x)
+    tl.store(answers.pose + 3 * b + 1, state.y)
+    tl.store(answers.pose + 3 * b + 2, state.theta)
+    tl.store(answers.error + b, state.error)
+    tl.store(answers.iterations + b, state.iterations)
 
 
 @triton.jit
@@ -152,23 +159,24 @@ def known(pixels):
 @triton.jit
 def weighed(frame, pixels, warp, whole, way):
     """``Weighted`` of the pixels that are in sight, as their blocks are trusted: reference.restrict."""
-    matrix, zero = tl.zeros((16, 16), tl.float32), tl.zeros((way.SLICE,), tl.float32)
+    zero, sums = tl.zeros((way.THREADS,), tl.float32), tl.zeros((16, 16), tl.float64)
     total, along, power = zero, zero, zero
-    for first in range(0, pixels.grid.HEIGHT * pixels.grid.PITCH, way.SLICE):
-        at = first + tl.arange(0, way.SLICE)
-        weight = counted(pixels, in_view(frame, pixels, warp, whole, at, way), at)
-        x, y = places(pixels, at)
-        R = columns(pixels, 1, at, x, y, way)
-        matrix += product(
-            stacked(columns(pixels, 0, at, x, y, way), way.LINES, way.SLICE) * weight[None, :],
-            stacked(R, way.LINES, way.SLICE),
-        )
-        total += weight
-        along += weight * R[3]
-        power += weight * R[3] * R[3]
+    for k in tl.static_range(0, way.LINES, AT_ONCE):
+        matrix = nothing(k, way.LINES, way.LINES, way.THREADS)
+        for first in range(0, pixels.grid.HEIGHT * pixels.grid.PITCH, way.THREADS):
+            at = first + tl.arange(0, way.THREADS)
+            weight = counted(pixels, in_view(frame, pixels, warp, whole, at, way), at)
+            x, y = places(pixels, at)
+            R = columns(pixels, 1, at, x, y, way)
+            ZW = scaled(columns(pixels, 0, at, x, y, way), weight, way.LINES)
+            matrix = with_products(matrix, ZW, R, k, way.LINES, way.LINES)
+            if k == 0:
+                total += weight
+                along += weight * R[3]
+                power += weight * R[3] * R[3]
+        sums = placed_in(sums, matrix, k, way.LINES, way.LINES)
     sum_w, sum_t, energy = tl.sum(total).to(tl.float64), tl.sum(along).to(tl.float64), tl.sum(power).to(tl.float64)
     contrast = tl.sqrt(tl.maximum(energy - sum_t * sum_t / tl.maximum(sum_w, SMALL), 0.0))
-    sums = matrix.to(tl.float64)
     solved = tl.arange(0, 16) < way.COLUMNS
     of_t = tl.where(solved, column_of(sums, 3), 0.0)
     of_one = tl.where(solved, column_of(sums, 4), 0.0)

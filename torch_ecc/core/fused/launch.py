@@ -26,8 +26,7 @@ class Shape(NamedTuple):
     """Of a program: what it takes at a time, see ``records.Way``, and how many warps."""
 
     pixels: int
-    blocks: int
-    slice: int
+    threads: int
     warps: int
 
 
@@ -35,8 +34,8 @@ def shape_for(device: torch.device, count: int) -> Shape:
     """Few templates have whole processors for themselves; of many, several share one. An interpreter's time is that of
     its steps."""
     if device.type == "cpu":
-        return Shape(2048, 512, 1024, 1)
-    return Shape(256, 16, 64, 4) if count > MANY else Shape(1024, 64, 64, 16)
+        return Shape(2048, 2048, 1)
+    return Shape(256, 128, 4) if count > MANY else Shape(1024, 512, 16)
 
 
 def call(
@@ -54,11 +53,11 @@ def call(
     grids = [_grids(packed, k) for k in range(len(packed.widths))]
     bend = start.new_zeros(len(start), 4) if distortion is None else distortion.contiguous()
     shape, constants = shape_for(image.device, n), 5 + max(code, 0)
-    fixed = code, constants, 3 if code < 0 else constants, len(grids) > 1, *shape[:3]
+    fixed = code, constants, 3 if code < 0 else constants, len(grids) > 1, *shape[:2]
     some, partial = (Way(tolerance, most, *_fixed(*fixed, either)) for either in (False, True))
     trusted, answers = _trusted(trust, packed, start), Answers._make([*results, start.new_empty(n, OF_LOOK.value)])
     with torch.cuda.device(image.device) if image.is_cuda else nullcontext():
-        for way in (some, partial)[trust is not None :]:
+        for way in (some, partial)[not Trust.whole(trust) :]:
             every = trusted, start.contiguous(), bend, answers, way
             kernel.solve[(n,)](frames, smooth, grids[0], grids[-1], *every, num_warps=shape.warps)
         look.answer[(n,)](smooth, grids[0], trusted, bend, answers, partial, num_warps=shape.warps)
@@ -86,7 +85,7 @@ def _trusted(trust: Trust | None, packed: Packed, start: Tensor) -> Trusted:
     """All of them, whole, if there is none: then nothing is read of it."""
     across, count = -(-packed.widths[0] // BLOCK), packed.results[4].shape[2]
     lines = 1 << (max(across, count // across) - 1).bit_length()
-    fixed = _fixed(across, count, lines, trust is not None)
-    if trust is None:
-        return Trusted(start, start, *fixed)
-    return Trusted(trust.which.contiguous(), trust.blocks.contiguous(), *fixed)
+    which, blocks, asked = trust or (start, None, None)
+    asked = start.new_ones(len(which), dtype=torch.bool) if asked is None else asked
+    fixed = _fixed(across, count, lines, blocks is not None)
+    return Trusted(which.contiguous(), (start if blocks is None else blocks).contiguous(), asked.contiguous(), *fixed)

@@ -57,10 +57,12 @@ class Grids(NamedTuple):
 
 
 class Trusted(NamedTuple):
-    """``solution.Trust``: ``blocks`` (n, COUNT), ACROSS of them side by side, of the templates at ``which`` (n,)."""
+    """``solution.Trust``: ``blocks`` (n, COUNT), ACROSS of them side by side, of the templates at ``which`` (n,) that
+    are ``asked`` (n,) for."""
 
     which: tl.tensor
     blocks: tl.tensor
+    asked: tl.tensor
     ACROSS: tl.constexpr
     COUNT: tl.constexpr
     LINES: tl.constexpr  # a power of two, no less than rows or columns of blocks
@@ -82,8 +84,8 @@ class Answers(NamedTuple):
 
 
 class Way(NamedTuple):
-    """How to solve. ``PIXELS`` at a time are sampled, or those of ``BLOCKS`` in the last look, and the columns of
-    ``SLICE`` pixels are one matrix."""
+    """How to solve. ``PIXELS`` at a time are sampled; of the columns' products, and of blocks in the last look, one is
+    each of so many ``THREADS``'."""
 
     tolerance: tl.tensor
     most: tl.tensor
@@ -92,8 +94,7 @@ class Way(NamedTuple):
     COLUMNS: tl.constexpr
     COARSER: tl.constexpr  # whether the first stage has a grid of its own
     PIXELS: tl.constexpr
-    BLOCKS: tl.constexpr
-    SLICE: tl.constexpr
+    THREADS: tl.constexpr
     PARTIAL: tl.constexpr  # whether pixels may be out of sight or not trusted
 
 

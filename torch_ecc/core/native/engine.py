@@ -47,7 +47,7 @@ def solve(
 ) -> Solution:
     """``solver.solve``: poses of B templates in (B or 1, 1, H, W) of one of ``DTYPES`` from ``start`` (B, 3) on, or of
     those that a ``trust`` is about."""
-    library, code = load(), code_of(reference.criterion)
+    library, code, trust = load(), code_of(reference.criterion), None if Trust.whole(trust) else trust
     if library is None or code is None:
         raise ValueError("native: expected what it takes")
     how = DEGREE[settings.interpolation], settings.max_iterations, settings.tolerance, code

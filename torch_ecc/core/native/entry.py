@@ -85,7 +85,9 @@ def _bent(distortion: Tensor | None, count: int) -> int:
 
 def _places(trust: Trust, sums: Tensor) -> tuple[int, int]:
     """Where its tensors lie. Raises ValueError if they are not about the blocks of ``sums`` (B, ..., blocks)."""
-    (which, value), (count, _, blocks) = trust, sums.shape
+    which, value, (count, _, blocks) = trust.which, trust.blocks, sums.shape
+    if value is None:
+        raise ValueError("trust: expected that of blocks, got None")
     if which.dtype != torch.int64 or value.dtype != torch.float32 or value.shape != (len(which), blocks):
         raise ValueError(
             f"trust: expected int64 (n,) and float32 (n, {blocks}), got {which.dtype}, {value.dtype} {value.shape}"
