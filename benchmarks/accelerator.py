@@ -4,9 +4,10 @@ Every iteration has to read of each pixel 4 rows of K and the frame's value, 20 
 iterations over the measured rate of a copy is the roofline, of which the share reached is printed. The page's solve is
 the one of an accelerator on any device, all iterations, no look of the host at a value: eager, as what torch.compile
 makes of it, and on a CUDA device replayed as a graph; there the fused engine too, which reads less and ends sooner than
-that, and on a CPU the native one, as it is used. First, what the gradient of poses costs. The cases come in the order
-of what they tell; when the ``--minutes`` are over those that are left are named. All is written as it comes. Nothing
-has to be installed: beside torch it imports numpy, OpenCV, kornia, pydantic, click and rich.
+that, and on a CPU the native one, as it is used. First, a whole tracker, frame by frame, from an H.264 file too, and
+what the gradient of poses costs. The cases come in the order of what they tell; when the ``--minutes`` are over those
+that are left are named. All is written as it comes. Nothing has to be installed: beside torch it imports numpy, OpenCV,
+kornia, pydantic, click and rich, and for the file what torch_ecc.io does.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections.abc import Sequence as Some
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import click
@@ -222,6 +224,78 @@ def gradient_cost(frames: list[Tensor], place: torch.device, count: int, size: i
     return Number(name, share, "", "lower", 0.3)
 
 
+def moving(device: torch.device, count: int = 60) -> list[Tensor]:
+    """Frames (H, W) of a slow movement, and those of the way back."""
+    views = list(Sequence(SCENE, Harmonic(3.0, 1.0, count).closed(), Camera()))
+    return [view.to(device).reshape(FRAME) for view in (*views, *views[-2:0:-1])]
+
+
+def whole_trackers(place: torch.device, counts: list[int], size: int) -> list[Number]:
+    """Of the fewest and the most templates; of the fewest under covers and from a file too."""
+    frames, few = moving(place), counts[0]
+    figures = [number for count in sorted({few, counts[-1]}) for number in tracked(frames, place, count, size)]
+    return [*figures, *tracked(frames, place, few, size, covered=True), *from_video(frames, place, few, size)]
+
+
+def tracked(frames: list[Tensor], place: torch.device, count: int, size: int, covered: bool = False) -> list[Number]:
+    """The time of a tracker per frame as it comes, robust as by default, and the memory of a template; ``covered``:
+    under stripes over a tenth of all of them."""
+    before = torch.cuda.memory_allocated(place) if place.type == "cuda" else 0
+    tracker = Tracker(frames[0], spread(count, size + 40, FRAME).round(), size, device=place)
+    if covered:
+        frames = [frame.clone() for frame in frames]
+        for frame in frames[1:]:
+            frame[::40] = frame[1::40] = frame[2::40] = frame[3::40] = 10
+    for frame in frames:  # which makes and records all that they need
+        found = tracker(frame)
+    held = torch.cuda.memory_allocated(place) - before if place.type == "cuda" else 0
+    wait(place)
+    start = time.perf_counter()
+    for frame in frames:
+        found = tracker(frame)
+    wait(place)
+    each = (time.perf_counter() - start) / len(frames)
+    name = f"tracker, {count} of {size} px{', a tenth covered' if covered else ''}"
+    good, kept = float((found.status == 0).float().mean()), held / count / 1e3
+    console.print(f"{name}: {1e3 * each:.3g} ms per frame, {count / each:,.0f} poses/s, {kept:.0f} kB per template")
+    console.print(f"  {good:.1%} CONVERGED in the last frame")
+    memory = [Number(f"{name}: memory of a template", kept, "kB")] if held else []
+    return [Number(f"{name}: time per frame", 1e3 * each, "ms", "lower", 0.3), *memory]
+
+
+def from_video(frames: list[Tensor], place: torch.device, count: int, size: int) -> list[Number]:
+    """Frames per second from an H.264 file to poses; nothing where PyAV is not there."""
+    try:
+        from torch_ecc.io import open_frames
+        from torch_ecc.io.overlay import OverlayWriter  # noqa: F401 - which needs PyAV
+    except ImportError as error:
+        console.print(f"from an H.264 file: not measured ({error})")
+        return []
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "moving.mp4"
+        written(path, frames)
+        first, *_ = open_frames(path)
+        tracker = Tracker(first.pixels, spread(count, size + 40, FRAME).round(), size, device=place)
+        taken = seconds(place, lambda: [tracker(frame.pixels) for frame in open_frames(path)], 2) / len(frames)
+    name = f"from an H.264 file, {count} of {size} px"
+    console.print(f"{name}: {1 / taken:,.0f} frames/s, {count / taken:,.0f} poses/s")
+    return [Number(name, 1 / taken, "frames/s", "higher", 0.3)]
+
+
+def written(path: Path, frames: list[Tensor]) -> None:
+    """An H.264 file of frames (H, W)."""
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=60, options={"crf": "10"})
+        stream.height, stream.width = frames[0].shape
+        stream.pix_fmt = "yuv420p"
+        for frame in frames:
+            picture = av.VideoFrame.from_ndarray(frame.byte().cpu().numpy(), "gray")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+
+
 def numbers(_: click.Context, __: click.Parameter, value: str | None) -> list[int] | None:
     """Of a list with commas."""
     return None if value is None else [int(v) for v in value.split(",")]
@@ -234,7 +308,7 @@ def numbers(_: click.Context, __: click.Parameter, value: str | None) -> list[in
 @click.option("--frames", default=10, show_default=True)
 @click.option("--iterations", default=8, show_default=True)
 @click.option("--minutes", default=7.0, show_default=True, help="begin nothing after so many")
-@click.option("--compiled/--no-compiled", default=True, show_default=True, help="what torch.compile makes of it too")
+@click.option("--ways", help=f"some of {', '.join(WAYS)} [default: all there are]")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
 @torch.no_grad()
 def main(
@@ -244,19 +318,22 @@ def main(
     frames: int,
     iterations: int,
     minutes: float,
-    compiled: bool,
+    ways: str | None,
     out: Path | None,
 ) -> None:
     """Poses per second, share of the roofline, agreement with the CPU."""
     place, end = torch.device(device), time.monotonic() + 60 * minutes
     counts = counts or ([1, 64, 1024, 4096, 16384] if place.type == "cuda" else [1, 16])
-    ways = [*THERE.get(place.type, ["eager"]), *(["compiled"] if compiled else [])]
+    every = [*THERE.get(place.type, ["eager"]), "compiled"]
+    chosen = every if ways is None else [way for way in every if way in ways.split(",")]
     shots = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).closed(), Camera())
     views, rate = [view[None].to(place) for view in shots], copy_rate(place)
     console.print(f"{card(place)}: copies {rate / 1e9:.1f} GB/s; {len(views) - 1} frames, {iterations} iterations")
-    figures, left = [Number("copy rate", rate / 1e9, "GB/s", "higher")], cases(counts, sizes, ways)
-    engines = dict.fromkeys(backend for backend, _ in (WAYS[way] for way in ways))
+    figures, left = [Number("copy rate", rate / 1e9, "GB/s", "higher")], cases(counts, sizes, chosen)
+    engines = dict.fromkeys(backend for backend, _ in (WAYS[way] for way in chosen))
     some = {counts[0], min(counts[-1], CHECKED)} if minutes > 0 else ()
+    if minutes > 0:
+        figures += whole_trackers(place, counts, sizes[-1])
     figures += [gradient_cost(views, place, count, sizes[-1], backend) for backend in engines for count in some]
     while left and time.monotonic() < end:
         case = left.pop(0)

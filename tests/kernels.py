@@ -13,8 +13,8 @@ from torch_ecc.core.fused.records import Answers, Frames, Grids, Trusted, Way
 
 HOPPER = GPUTarget("cuda", 90, 32)
 CONSTANT = "constexpr"
-# Of each argument the types, and the values of its constants: a frame of bytes, cubic splines, templates of 31 px.
-FRAMES = Frames("*u8", "i32", "i32", "i32", CONSTANT), [1]
+# Of each argument the types, and the values of its constants: a frame, cubic splines, templates of 31 px.
+FRAMES = Frames("*fp32", "i32", "i32", "i32", CONSTANT), [1]
 SMOOTH = Frames("*fp32", "i32", "i32", "i32", CONSTANT), [3]
 GRIDS = Grids("*i16", "*fp32", "*fp64", *5 * (CONSTANT,)), [31, 31, 32, 1, True]
 TRUSTED = Trusted("*i64", "*fp32", "*i1", *4 * (CONSTANT,)), [6, 36, 8, False]
@@ -23,7 +23,7 @@ ANSWERS = Answers("*fp64", "*fp64", "*i64", "*fp64", "*fp32", "*fp64", "*fp64", 
 
 def way(partial: bool) -> tuple[Way, list[int | bool]]:
     """Of the default criterion."""
-    return Way("fp32", "i32", *7 * (CONSTANT,)), [2, 7, 7, False, 256, 128, partial]
+    return Way("fp32", "fp32", *7 * (CONSTANT,)), [2, 7, 7, False, 256, 128, partial]
 
 
 def compiled() -> Iterator[str]:

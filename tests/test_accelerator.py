@@ -109,7 +109,7 @@ def test_the_benchmark_runs(tmp_path):
     """In little; what no time is left for is named."""
     out = tmp_path / "figures.json"
     few = ["--device", "cpu", "--counts", "1,2", "--sizes", "31", "--frames", "2", "--iterations", "2"]
-    told = CliRunner().invoke(accelerator.main, [*few, "--no-compiled", "--out", str(out)])
+    told = CliRunner().invoke(accelerator.main, [*few, "--ways", "native,eager", "--out", str(out)])
     assert told.exit_code == 0, told.output
     figures = load(out).figures
     assert figures["2 of 31 px, bspline3, eager: poses"].value > 0

@@ -58,7 +58,7 @@ def solve(frames, smooth, fine, coarse, trusted, start, bend, answers, way):
     if left:
         first, last = one_of(coarse, trusted, k, b), one_of(fine, trusted, k, b)
         state, well, bend, look = beginning(start + 3 * k), b >= 0, bend + 4 * k, answers.looks + b * OF_LOOK
-        enough, some = tl.maximum(way.tolerance, COARSE_TOLERANCE), tl.maximum(way.most * 2 // 3, 1)
+        enough, some = tl.maximum(way.tolerance, COARSE_TOLERANCE), tl.maximum(tl.floor(way.most * 2 / 3), 1)
         if (way.COARSER or smooth.DEGREE > 1) and way.most > 1:
             state, well = iterate(
                 View(frames.grey + k * frames.next, frames),

@@ -47,14 +47,15 @@ def call(
     degree, most, tolerance, code = how
     n = len(start if trust is None else trust.which)
     results = [result.new_empty((n, *result.shape[1:])) for result in packed.results]
+    image = image.float()
     frames = smooth = _frames(image, 1, image.shape)
     if degree > 1:
-        smooth = _frames(Sampler.of(image.float(), SAMPLER[degree]).values, degree, image.shape)
+        smooth = _frames(Sampler.of(image, SAMPLER[degree]).values, degree, image.shape)
     grids = [_grids(packed, k) for k in range(len(packed.widths))]
     bend = start.new_zeros(len(start), 4) if distortion is None else distortion.contiguous()
     shape, constants = shape_for(image.device, n), 5 + max(code, 0)
     fixed = code, constants, 3 if code < 0 else constants, len(grids) > 1, *shape[:2]
-    some, partial = (Way(tolerance, most, *_fixed(*fixed, either)) for either in (False, True))
+    some, partial = (Way(tolerance, float(most), *_fixed(*fixed, either)) for either in (False, True))
     trusted, answers = _trusted(trust, packed, start), Answers._make([*results, start.new_empty(n, OF_LOOK.value)])
     with torch.cuda.device(image.device) if image.is_cuda else nullcontext():
         for way in (some, partial)[not Trust.whole(trust) :]:
@@ -85,7 +86,8 @@ def _trusted(trust: Trust | None, packed: Packed, start: Tensor) -> Trusted:
     """All of them, whole, if there is none: then nothing is read of it."""
     across, count = -(-packed.widths[0] // BLOCK), packed.results[4].shape[2]
     lines = 1 << (max(across, count // across) - 1).bit_length()
-    which, blocks, asked = trust or (start, None, None)
+    iterations, none = packed.results[2], packed.tensors[1]  # of the same types: else there would be another kernel
+    which, blocks, asked = trust or (iterations, None, None)
     asked = start.new_ones(len(which), dtype=torch.bool) if asked is None else asked
     fixed = _fixed(across, count, lines, blocks is not None)
-    return Trusted(which.contiguous(), (start if blocks is None else blocks).contiguous(), asked.contiguous(), *fixed)
+    return Trusted(which.contiguous(), (none if blocks is None else blocks).contiguous(), asked.contiguous(), *fixed)

@@ -85,7 +85,7 @@ class Answers(NamedTuple):
 
 class Way(NamedTuple):
     """How to solve. ``PIXELS`` at a time are sampled; of the columns' products, and of blocks in the last look, one is
-    each of so many ``THREADS``'."""
+    each of so many ``THREADS``'. (The most iterations are no whole number: Triton would make one more kernel of 1.)"""
 
     tolerance: tl.tensor
     most: tl.tensor
