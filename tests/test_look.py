@@ -4,6 +4,7 @@ torch has traced of it."""
 from __future__ import annotations
 
 import copy
+from functools import partial
 
 import pytest
 import torch
@@ -112,6 +113,31 @@ def test_it_is_recorded_again_for_what_it_does_not_fit(monkeypatch):
     assert (found.pose - other.track(third).pose).abs().max() < 1e-4
     follow.load_state_dict(other.state_dict())
     assert not follow._look.graphs
+
+
+def test_what_is_put_off_is_done_again(request, monkeypatch):
+    """In the frame that needs it, a graph of its own finds what the whole look does, and what it remembers."""
+    first, *others = frames()
+    others[1] = others[1].clone()
+    others[1][..., :20, :] = 250  # over some of both templates
+    made = partial(te.Tracker, first, [(36.0, 32.0), (52.0, 38.0)], 41, backend="torch", search=False)
+    plain = made()
+    request.getfixturevalue("blind")
+    wanted = [plain.track(frame) for frame in others]
+    assert (wanted[1].coverage < 0.95).all()
+    assert (wanted[2].coverage == 1).all()
+    monkeypatch.setattr(look, "has_graphs", lambda device: True)
+    monkeypatch.setattr(look, "recorded", done_again)
+    follow, graphs = made(), []
+    for frame, known in zip(others, wanted, strict=True):
+        found = follow.track(frame)
+        graphs.append(len(follow._look.graphs))
+        assert torch.equal(found.status, known.status)
+        for name in ("pose", "coverage", "covariance"):
+            torch.testing.assert_close(getattr(found, name), getattr(known, name), rtol=1e-5, atol=1e-9)
+    assert graphs == [1, 2, 2]
+    for name in ("trust", "answered", "score"):
+        torch.testing.assert_close(getattr(follow, name), getattr(plain, name))
 
 
 @pytest.mark.usefixtures("_graphs")
