@@ -279,6 +279,25 @@ def test_the_covariance_knows_of_residuals_that_cling_together(cling):
     assert 0.6 < honesty(60, 61, 0.0, noise) < 2.5
 
 
+def test_the_covariance_knows_where_noise_is():
+    """Photons, of which the darker two thirds of a scene give none: all the noise is where the template's gradients
+    are, and spread over all of it would count for a third of what it is (2.6)."""
+    count, side, draw = 60, 81, torch.Generator().manual_seed(81)
+
+    def counted(pose: torch.Tensor, size: int) -> torch.Tensor:
+        light = (SCENE.render(pose, (size, size)) - 150).clamp(min=0)
+        return torch.poisson(0.05 * light, generator=draw)
+
+    place = torch.rand(count, 3, generator=draw, dtype=torch.float64) - 0.5
+    truth = at(side / 2 + 20, side / 2 + 20) + place * torch.tensor([8.0, 8.0, 0.2])
+    reference = prepare(counted(at((side - 1) / 2, (side - 1) / 2).expand(count, 3), side))
+    found = align(reference, counted(truth, side + 40), truth)
+    good, error = found.status == Status.CONVERGED, (found.pose - truth)[:, :, None]
+    square = (error.mT @ torch.linalg.inv(found.covariance) @ error)[:, 0, 0] / 3
+    assert int(good.sum()) > 0.9 * count
+    assert 0.6 < float(square[good].mean()) < 1.9
+
+
 @pytest.mark.parametrize(("amplitude", "status"), [(6.0, Status.CONVERGED), (0.8, Status.LOW_TEXTURE)])
 def test_a_pose_that_is_known_to_half_a_pixel_is_known(amplitude, status):
     """A clean template with a faint wave along y', 30 grey levels of noise in the frame: sigma is that noise times

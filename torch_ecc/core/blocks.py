@@ -22,7 +22,8 @@ class Blocks(NamedTuple):
     """Of the blocks of B templates, (B, blocks) each: their ``weight``, the weighted sum of ``t`` less its mean and of
     its ``square``, the mean square of the texture's slopes, or of those around if that is more, ``slope``; and which of
     those that hold pixels enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``:
-    either; ``share``: what their weighted sums are to be multiplied by for a mean, 0 of the others."""
+    either; ``share``: what their weighted sums are to be multiplied by for a mean, 0 of the others; by how much their
+    slopes count as instruments, the mean of ``wiener``."""
 
     weight: Tensor
     t: Tensor
@@ -32,6 +33,7 @@ class Blocks(NamedTuple):
     steep: Tensor
     enough: Tensor
     share: Tensor
+    wiener: Tensor
 
 
 # By what parts of a target, at (x, y) about its centre, may move other than as one, and whether that is half a turn:
@@ -64,16 +66,17 @@ def blocks_of(reference: Reference) -> Blocks:
     grid, weight = reference.grid, reference.weight
     t, _ = centred(reference.signal[:, 3], weight)
     slopes = reference.columns.wiener * reference.signal[:, :2].square().sum(1)
-    rows = torch.stack((weight, weight * t, weight * t * t, weight * slopes), 1)
-    sums = rows.new_zeros(len(t), 4, grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
-    count, of_t, square, slope = sums.unbind(1)
+    rows = torch.stack((weight, weight * t, weight * t * t, weight * slopes, weight * reference.columns.wiener), 1)
+    sums = rows.new_zeros(*rows.shape[:2], grid.blocks[0] * grid.blocks[1]).index_add_(2, grid.block, rows)
+    count, of_t, square, slope, wiener = sums.unbind(1)
     slope = (slope / count.clamp(min=1e-30)).view(-1, *grid.blocks)
     around = F.avg_pool2d(slope, 3, 1, 1, count_include_pad=False)  # blur brings edges from the next block
     slope = torch.maximum(slope, around).flatten(1)
     enough = count > HALF_FULL * count.amax(1, keepdim=True)
     middle = torch.where(enough, slope, torch.nan).nanmedian(1, keepdim=True).values
     share = torch.where(enough, 1 / count, 0.0)
-    return Blocks(count, of_t, square, slope, enough & (slope <= middle), enough & (slope > middle), enough, share)
+    flat, wiener = slope <= middle, wiener / count.clamp(min=1e-30)
+    return Blocks(count, of_t, square, slope, enough & flat, enough & ~flat, enough, share, wiener)
 
 
 def parts_of(reference: Reference) -> Parts:

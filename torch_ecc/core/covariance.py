@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from torch_ecc.core.noise import Noise
-from torch_ecc.core.normal import Normal
+from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.solution import Solution
 
@@ -91,6 +91,20 @@ def hidden(reference: Reference, found: Solution, white: Tensor) -> Tensor | Non
     meat = torch.einsum("bpqn,bn->bpq", reference.parts.normal, near.to(reference.parts.normal)).to(rows)
     spread = rows @ meat @ rows.mT
     return UNNOTICED / 2 * white.view(-1, 1, 1) * (spread + spread.mT)
+
+
+def unevenness(instruments: Tensor, found: Solution, whole: bool) -> Tensor:
+    """How many times as much is left (B,) where a template's gradients count as in all of it that is believed; its
+    ``instruments`` (B, blocks, 1): by how much they do, over the mean. ``whole``: all of it is believed, and in sight.
+
+    Where there is no light there is no noise, and no gradient either: all of it is where errors in variables count.
+    """
+    left = found.total[:, 6].clamp(min=LEAST)
+    if whole:
+        return torch.bmm(found.sums[:, 6:7], instruments).flatten() / left
+    sums = found.sums[:, 0:7:6] if found.trust is None else found.sums[:, 0:7:6] * found.trust[:, None]
+    pixels, there = (sums @ instruments)[:, :, 0].unbind(1)
+    return there * found.total[:, 0] / (pixels * left).clamp(min=LEAST)
 
 
 def coherence(axes: Tensor, sides: Tensor) -> Tensor:

@@ -14,7 +14,15 @@ from torch import Tensor
 
 from torch_ecc.core.ambient import constant, lasting
 from torch_ecc.core.clinging import clinging, scale_of
-from torch_ecc.core.covariance import Sandwich, coherence, hidden, largest_variance, pose_covariance, sandwich
+from torch_ecc.core.covariance import (
+    Sandwich,
+    coherence,
+    hidden,
+    largest_variance,
+    pose_covariance,
+    sandwich,
+    unevenness,
+)
 from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.core.noise import NOISE_SHARE
@@ -31,6 +39,9 @@ LEAST_COVERAGE = 0.5  # of the weight in sight must be believed: else what cover
 LEAST_INFORMATION = 0.2  # of that of all pixels in sight must be left in what is believed, in x, y and theta each
 AMBIGUITY_MARGIN = (1.5, 0.01)  # (a, b): a score s is as good as the best if 1 - s <= a (1 - s_best) + b
 LARGEST_SIGMA = 0.5  # px at the farthest pixel: beyond it the texture does not fix the pose
+LITTLE_NOISE = 0.1  # of the information: where it lies is no matter
+MOST_UNEVEN = 2.0  # times the template's noise there may be where its gradients count: what more is left is none
+UNEVEN_SHARE = 0.75  # of the information may be noise that was seen there, NOISE_SHARE if it is only supposed
 LEAST_SHARE = 0.2  # of the information, if it is white: with less, noise of no spectrum fixes a pose
 DOUBTFUL_SHARE = 0.8  # of the noise that there may be, as the likely reason why a template was not found
 LEAST_CONTRAST = 0.1  # of the template's: what has less is flat, and so is what has no more than
@@ -58,13 +69,16 @@ class Known(NamedTuple):
     """What the verdict on B templates needs, the same in every frame: ``free`` and ``template_free`` (B,), the degrees
     of freedom of what a residual's square sum is made of, frame and template; ``per_frame`` (B,), one over how many
     frames a template is the mean of; ``clusters`` (B, 9), see ``clinging.scale_of``, None if there are too few blocks;
-    ``share`` (B,), ``noise_share`` of a variance of 1; ``sandwich``, see there."""
+    ``share`` (B,), ``noise_share`` of a variance of 1; ``instruments``, of which there is noise enough for it to matter
+    where it is, (B,) bool, and by how much blocks count there, see ``unevenness``, None if of none; ``sandwich``, see
+    there."""
 
     free: Tensor
     template_free: Tensor
     per_frame: Tensor
     clusters: Tensor | None
     share: Tensor
+    instruments: tuple[Tensor, Tensor] | None
     sandwich: Sandwich
 
 
@@ -77,8 +91,19 @@ def known_of(reference: Reference, normal: Normal, interpolation: str) -> Known:
         per_frame,
         scale_of(reference.grid, normal),
         normal.noise_share / NOISE_SHARE,
+        instruments(reference, normal),
         sandwich(noise, normal, interpolation),
     )
+
+
+def instruments(reference: Reference, normal: Normal) -> tuple[Tensor, Tensor] | None:
+    """See ``Known``."""
+    noisy = normal.noise_share * reference.noise.power > LITTLE_NOISE
+    if is_cpu(noisy.device) and not bool(noisy.any()):
+        return None
+    weight, wiener = reference.blocks.weight, reference.blocks.wiener
+    mean = (wiener * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
+    return noisy, (wiener / mean.clamp(min=LEAST))[:, :, None]
 
 
 def known(reference: Reference, normal: Normal, interpolation: str) -> Known:
@@ -108,12 +133,12 @@ def judge(
     # NG v.
     variance = error / torch.addcmul(constant.free, power, constant.template_free)
     of_template = variance * constant.per_frame
-    bias, white = torch.minimum(of_template, reference.noise.power), torch.addcmul(variance, of_template, power)
+    (bias, most), white = biases(reference, found, constant, of_template), torch.addcmul(variance, of_template, power)
     clings = clinging(reference, found, white, constant.clusters)
     coherent = None if settings.interpolation not in reference.noise.alias else coherence(axes, reference.grid.sides)
     covariance = pose_covariance(constant.sandwich, variance, power, bias, clings.scatter, coherent)
     unseen = hidden(reference, found, variance / power), unlike(reference, found, score, clings)
-    unobservable = largest_variance(reference.place.lever2, covariance), constant.share * bias
+    unobservable = largest_variance(reference.place.lever2, covariance), constant.share * most
     visible, believed = seen_and_believed(reference, found)
     share, on_cpu = normal.noise_share * variance, is_cpu(pose.device)
     if push is not None and normal is reference.normal and not (on_cpu and max(share.tolist()) <= LEAST_SHARE):
@@ -133,6 +158,18 @@ def judge(
         covariance = torch.where(good[:, None, None], covariance, unknown(covariance))
     moved = pose - (start if origin is None else origin)
     return Estimate(pose, moved, score, status, found.iterations, covariance, rms, tracked, believed, reason)
+
+
+def biases(reference: Reference, found: Solution, constant: Known, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """Variances (B,) of the templates' noise where their gradients count, of which frames have ``seen`` (B,) in all of
+    them: that which is likely, and that by which its share of the information is told."""
+    even = torch.minimum(seen, reference.noise.power)
+    if constant.instruments is None:
+        return even, even
+    noisy, weights = constant.instruments
+    uneven = even * unevenness(weights, found, found.normal is reference.normal)
+    likely = torch.where(noisy, torch.minimum(uneven, MOST_UNEVEN * reference.noise.power), even)
+    return likely, torch.maximum(even, NOISE_SHARE / UNEVEN_SHARE * likely)
 
 
 def beyond_doubt(amounts: Sequence[Tensor], settings: Settings) -> bool:
