@@ -236,6 +236,10 @@ def test_a_tracker_goes_from_state_to_state() -> None:
             came = tracker(frame)
         assert_same(list(came), list(same(frame)))
     assert not any(part.is_inference() for part in tracker.buffers())
+    weight = torch.ones(3, dtype=torch.float64, requires_grad=True)
+    pose = tracker(FRAMES[0]).pose
+    (pose * weight).sum().backward()  # what a tracker answers with are ordinary tensors
+    assert torch.equal(weight.grad, pose[0])
 
 
 def test_autocast_goes_on_behind_a_door() -> None:
