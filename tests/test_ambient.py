@@ -130,7 +130,7 @@ def nothing() -> None:
 
 # How an object is made, and what is asked of it.
 CALLS = {
-    **{f"Tracker, {name}": (tracker(backend=name), follow) for name in BACKENDS},
+    **{f"Tracker, {name}": (tracker(backend=name, search=name != "torch"), follow) for name in BACKENDS},
     "levels, ssd": (tracker(backend="torch", levels=2, criterion="ssd"), step),
     "quadratic light, a mask": (tracker(illumination="quadratic", mask=DISC), step),
     "tensors that the state has made": (

@@ -78,8 +78,8 @@ def spoilt(image: np.ndarray, what: str, middle: np.ndarray, size: int, rng: np.
 @pytest.mark.parametrize("spread", [0.0, 0.05], ids=["equal", "nearly equal"])
 @pytest.mark.parametrize("what", ["dust", "glint", "lamp", "needle", "cover", "hidden"])
 def test_what_lies_on_a_part_of_an_array_for_a_frame_leads_to_no_other_part(what, spread):
-    """Six arrays each: the search changes nothing, and in clean frames again nothing is wrong and believed."""
-    for seed in range(6):
+    """Four arrays each: the search changes nothing, and in clean frames again nothing is wrong and believed."""
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         image, middle, size = parts(rng, spread)
         first, *rest = (
@@ -95,7 +95,7 @@ def test_what_lies_on_a_part_of_an_array_for_a_frame_leads_to_no_other_part(what
 
 @pytest.mark.parametrize("spread", [0.0, 0.02])
 def test_less_noise_than_in_the_first_frame_makes_no_look_alike_the_better_one(spread):
-    for seed in range(100, 108):
+    for seed in range(100, 104):
         rng = np.random.default_rng(seed)
         image, middle, size = parts(rng, spread)
         first = noisy(image + rng.normal(0, 6, image.shape), rng)
