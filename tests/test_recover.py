@@ -417,7 +417,7 @@ def test_searches_take_no_more_than_their_share(monkeypatch):
     for share in (0.1, 1.0):
         searched.clear()
         tracker = Tracker(stack[0], [(160.0, 120.0)], 31, search_share=share)
-        reasons = [int(tracker(other).reason) for _ in range(100)]
+        reasons = [int(tracker(other).reason) for _ in range(60)]
         counts[share] = len(searched)
         assert (te.Reason.WAITING in reasons) == (share < 1)
     assert counts[0.1] < counts[1.0]
