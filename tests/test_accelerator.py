@@ -7,8 +7,9 @@ import pytest
 import torch
 from click.testing import CliRunner
 from results import load
-from torch.fx.experimental.proxy_tensor import make_fx
+from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
 
 from torch_ecc import align, prepare
 from torch_ecc.core.align import solve
@@ -32,6 +33,31 @@ class NoWaiting(TorchDispatchMode):
         if name in WAITS or by_mask:
             raise AssertionError(f"an accelerator would wait for the host in {func}")
         return func(*args, **(kwargs or {}))
+
+
+class Recording(NoWaiting):
+    """What torch is asked to do, on the memory that it was done on, to be done again."""
+
+    def __init__(self):
+        super().__init__()
+        self.done = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = super().__torch_dispatch__(func, types, args, kwargs)
+        self.done.append((func, args, kwargs or {}, result))
+        return result
+
+    def again(self, result, old: tuple[Tensor, ...] = (), new: tuple[Tensor, ...] = ()):
+        """What the ``result`` is then, with ``new`` tensors in the place of ``old`` ones."""
+        now = dict(zip(map(id, old), new, strict=True))
+
+        def renewed(values):
+            return tree_map_only(Tensor, lambda tensor: now.get(id(tensor), tensor), values)
+
+        for func, args, kwargs, came in self.done:
+            once_more = func(*renewed(args), **renewed(kwargs))
+            now |= zip(map(id, tree_leaves(came)), tree_leaves(once_more), strict=True)
+        return renewed(result)
 
 
 def problem(seed: int, count: int = 6):
@@ -67,6 +93,7 @@ def test_it_gives_what_a_cpu_gives(interpolation, scale, request):
     """With a coarser grid first (scale 3) and without, inside the frame and across its border."""
     templates, images, start = problem(1)
     if scale > 1:
+        templates, images, start = templates[-3:], images[-3:], start[-3:]
         templates, images = (torch.nn.functional.interpolate(v.float(), scale_factor=3) for v in (templates, images))
         start = start * torch.tensor([3.0, 3.0, 1.0]) + torch.tensor([1.0, 1.0, 0.0])
     reference = prepare(templates)
@@ -90,11 +117,14 @@ def test_one_graph_serves_all_frames(blind):
         found = solve(reference, image, pose, settings)
         return found.pose, found.status
 
-    graph = make_fx(pose_and_status)(images, start)
+    pose_and_status(images, start)  # constants are made
+    with Recording() as recording:
+        first = pose_and_status(images, start)
     _, others, begin = problem(3)
-    for replayed, direct in zip(graph(others, begin), pose_and_status(others, begin), strict=True):
-        assert torch.equal(replayed, direct)
-    assert not torch.equal(graph(others, begin)[0], pose_and_status(images, start)[0])
+    replayed, direct = recording.again(first, (images, start), (others, begin)), pose_and_status(others, begin)
+    for a, b in zip(replayed, direct, strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(replayed[0], first[0])
 
 
 def test_what_has_converged_stays(blind):
@@ -108,7 +138,7 @@ def test_what_has_converged_stays(blind):
 def test_the_benchmark_runs(tmp_path):
     """In little; what no time is left for is named."""
     out = tmp_path / "figures.json"
-    few = ["--device", "cpu", "--counts", "1,2", "--sizes", "31", "--frames", "2", "--iterations", "2"]
+    few = ["--device", "cpu", "--counts", "2", "--sizes", "31", "--frames", "2", "--iterations", "2"]
     told = CliRunner().invoke(accelerator.main, [*few, "--ways", "native,eager", "--out", str(out)])
     assert told.exit_code == 0, told.output
     figures = load(out).figures

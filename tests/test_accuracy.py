@@ -28,7 +28,7 @@ SCENES = {"waves": SCENE, "pads": Pads.wafer()}
 
 @pytest.mark.parametrize(("noise", "turn"), [(0.0, False), (0.0, True), (2.0, True), (5.0, False), (10.0, True)])
 def test_scatter_reaches_the_bound_and_the_covariance_says_so(noise, turn):
-    count = 200
+    count = 120
     found = scatter(SCENE, Draws(noise, count, turn, seed=int(noise)))
     assert (found.status == Status.CONVERGED).all()
     chance = 1 + 2.5 / math.sqrt(2 * count)  # of an rms over so many draws
@@ -43,7 +43,7 @@ def test_scatter_reaches_the_bound_and_the_covariance_says_so(noise, turn):
 
 def test_flat_areas_do_not_add_scatter():
     """Pads are mostly flat: there a noisy template's gradients are nothing but noise."""
-    count = 200
+    count = 120
     found = scatter(Pads.wafer(), Draws(10.0, count, seed=10))
     chance = 1 + 2.5 / math.sqrt(2 * count)
     assert (found.ratio <= 1.1 * chance).all(), found.ratio

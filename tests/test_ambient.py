@@ -130,7 +130,7 @@ def nothing() -> None:
 
 # How an object is made, and what is asked of it.
 CALLS = {
-    **{f"Tracker, {name}": (tracker(backend=name), follow) for name in BACKENDS},
+    **{f"Tracker, {name}": (tracker(backend=name, search=name != "torch"), follow) for name in BACKENDS},
     "levels, ssd": (tracker(backend="torch", levels=2, criterion="ssd"), step),
     "quadratic light, a mask": (tracker(illumination="quadratic", mask=DISC), step),
     "tensors that the state has made": (
@@ -236,6 +236,10 @@ def test_a_tracker_goes_from_state_to_state() -> None:
             came = tracker(frame)
         assert_same(list(came), list(same(frame)))
     assert not any(part.is_inference() for part in tracker.buffers())
+    weight = torch.ones(3, dtype=torch.float64, requires_grad=True)
+    pose = tracker(FRAMES[0]).pose
+    (pose * weight).sum().backward()  # what a tracker answers with are ordinary tensors
+    assert torch.equal(weight.grad, pose[0])
 
 
 def test_autocast_goes_on_behind_a_door() -> None:

@@ -12,6 +12,7 @@ from test_accelerator import problem
 from torch import Tensor, nn
 
 import torch_ecc as te
+from torch_ecc.core import robust
 from torch_ecc.core.sampling import prefilter
 
 TRACED = pytest.mark.skipif(torch.__version__ < (2, 13), reason="older versions trace less")
@@ -37,8 +38,9 @@ def assert_same(came, wanted: te.Estimate) -> None:
 
 
 @TRACED
-def test_align_is_one_graph(blindly):
-    """Robust as it is by default."""
+def test_align_is_one_graph(blindly, monkeypatch):
+    """Robust as it is by default, but for the number of rounds, which are alike."""
+    monkeypatch.setattr(robust, "FEW_ROUNDS", 1)
     templates, images, start = problem(0)
     reference, options = te.prepare(templates), FEW | {"max_iterations": 1}
     compiled = torch.compile(te.align, backend="aot_eager", fullgraph=True, dynamic=False)

@@ -50,8 +50,18 @@ class Offset:
         return Fit(difference - offset, torch.ones_like(g[:, 0]))
 
 
+class Differentiated(Offset):
+    """The same by autograd."""
+
+    def step(self, reference: Prepared, g: Tensor) -> Tensor:
+        """The slope of b along ones."""
+        with torch.enable_grad():
+            ones = torch.ones(len(g), 3, requires_grad=True)
+            return torch.autograd.grad((super().step(reference, g) * ones).sum(), ones)[0]
+
+
 @pytest.mark.parametrize("levels", [1, 2])
-@pytest.mark.parametrize("criterion", ["offset", Offset()], ids=str)
+@pytest.mark.parametrize("criterion", ["offset", Offset(), Differentiated()], ids=str)
 def test_a_criterion(criterion, levels, monkeypatch):
     """Made for another offset in every frame, which squared differences alone take for motion; by name or as it is."""
     monkeypatch.setitem(criteria.CRITERIA, "offset", lambda light: Offset())

@@ -8,8 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from test_accelerator import NoWaiting
-from torch.fx.experimental.proxy_tensor import make_fx
+from test_accelerator import NoWaiting, Recording
 
 import torch_ecc as te
 from torch_ecc.core.pushed import strongest, weakest
@@ -34,11 +33,12 @@ def tracker(first: torch.Tensor, **options) -> te.Tracker:
 
 def traced(work, _):
     """``look.recorded`` by the operations that torch sees, on the memory that they had."""
-    result = work()
-    operations = make_fx(work)()
+    result = work()  # constants are made
+    with Recording() as recording:
+        same = work()
 
     def repeat() -> None:
-        for old, new in zip(*(torch.utils._pytree.tree_leaves(r) for r in (result, operations())), strict=True):
+        for old, new in zip(*map(torch.utils._pytree.tree_leaves, (result, recording.again(same))), strict=True):
             if old is not None:
                 old.copy_(new)
 

@@ -78,7 +78,7 @@ def test_scale_axes_and_lens_from_commanded_moves(tracker):
     sent = STAGE.to_physical(moved)[:, :2] + torch.tensor([7.0, -2.0])
     sent[3] = torch.nan  # nobody knows
     truth = torch.tensor((*STAGE.scales, STAGE.axis_angle))
-    for seed in range(6):
+    for seed in range(4):
         noise = 0.01 * torch.randn(len(sent), 2, generator=torch.Generator().manual_seed(seed)).double()
         fit = calibrate(seen(tracker, moved, seed), sent + noise, tracker=tracker)
         found = torch.tensor((*fit.calibration.scales, fit.calibration.axis_angle)) - truth

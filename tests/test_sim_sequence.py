@@ -206,8 +206,10 @@ def test_a_template_is_marked_where_the_lens_shows_it():
 def test_every_alternative_of_the_shipped_configuration_works(text, tmp_path):
     cv2.imwrite(str(tmp_path / "still.png"), np.random.default_rng(0).integers(0, 256, (60, 70), dtype=np.uint8))
     (tmp_path / "poses.csv").write_text("x_px,y_px,theta_rad\n1,2,0.1\n")
-    simulation = from_config(tomllib.loads(text), folder=tmp_path)
-    assert simulation.sequence.batch(0, 1).shape == (1, 1, 480, 640)
+    settings = {"template": {"center": [95, 90], "size": [41, 41]}} | tomllib.loads(text)
+    settings["camera"] = {"size": [180, 200]} | settings.get("camera", {})
+    simulation = from_config(settings, folder=tmp_path)
+    assert simulation.sequence.batch(0, 1).shape == (1, 1, 180, 200)
 
 
 def test_degrees_are_radians_by_another_name():

@@ -124,6 +124,6 @@ def found(
 
 def engine_for(reference: Reference, image: Tensor, settings: Settings) -> Engine:
     """The one that solves this, and sees what the camera shows."""
-    fit = [engine.solve for engine in (native, fused) if engine.takes(reference, image, settings)]
-    engine = fit[0] if fit else solver.solve
+    fit = (engine.solve for engine in (native, fused) if engine.takes(reference, image, settings))
+    engine = next(fit, solver.solve)
     return engine if reference.sight is None else partial(sight.solve, engine)

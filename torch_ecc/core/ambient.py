@@ -8,8 +8,8 @@ tensor is made with its own dtype and device.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
 from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
@@ -49,6 +49,23 @@ def plain(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
             return function(*args, **kwargs)
 
     return protected
+
+
+_below: Callable[[], AbstractContextManager[None]] = torch._C._AutoDispatchBelowAutograd
+
+
+def unrecorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """``function`` of tensors whose gradients nobody asks for: torch does not look for any, which is a tenth of what
+    small operations cost. Unlike those made in inference mode its results are ordinary tensors."""
+
+    @wraps(function)
+    def quick(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        with _below():
+            return function(*args, **kwargs)
+
+    return quick
 
 
 def ordinary(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -108,19 +125,21 @@ def constant(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     return made
 
 
-@contextmanager
-def threads_for(pixels: int) -> Iterator[None]:
+class threads_for:  # noqa: N801 - a context, which a generator would make more slowly
     """As many of the caller's threads as templates of so many ``pixels`` are worth; one for most.
 
     Threads wait for each other at the end of every operation that they share, spinning: on a computer that also does
     something else, a tenth of a millisecond of work then takes as long as a time slice.
     """
-    most, callers = torch.get_num_threads(), threads_of_caller()
-    some = min(1 + pixels // PIXELS_PER_THREAD, most)
-    torch.set_num_threads(some)
-    _here.threads = callers
-    try:
-        yield
-    finally:
-        torch.set_num_threads(most)
-        _here.threads = None if callers == most else callers
+
+    def __init__(self, pixels: int) -> None:
+        self.pixels = pixels
+
+    def __enter__(self) -> None:
+        self.most, self.callers = torch.get_num_threads(), threads_of_caller()
+        torch.set_num_threads(min(1 + self.pixels // PIXELS_PER_THREAD, self.most))
+        _here.threads = self.callers
+
+    def __exit__(self, *failure: object) -> None:
+        torch.set_num_threads(self.most)
+        _here.threads = None if self.callers == self.most else self.callers

@@ -57,20 +57,21 @@ def clinging(reference: Reference, found: Solution, white: Tensor, scale: Tensor
     unit, on_cpu = scale / white.unsqueeze(1), is_cpu(white.device)
     ratio = (found.total[:, SUMS:] * unit).view(-1, 3, 3)
     scatter = ratio[:, :1].clamp(min=1.0)
-    certain = (ratio > scatter).flatten(1).any(1)  # of lines, that they scatter more; blocks never do
-    if on_cpu and not bool(certain.any()):
+    more = ratio > scatter  # of lines, for certain; blocks never do
+    if on_cpu and not bool(more.any()):
         return Clinging(scatter, ratio, None)
+    certain = more.flatten(1).any(1)
     all_of_it = Residuals(found.sums[:, 7:], ratio, unit, found.gain, strains(reference, found))
     if not on_cpu or bool(certain.all()):
-        more, strained = explained(all_of_it, reference.grid.blocks)
+        lines, strained = explained(all_of_it, reference.grid.blocks)
         chosen = certain[:, None, None]
         strained = None if strained is None else torch.where(chosen, strained, 0.0)
-        return Clinging(torch.where(chosen, more, scatter), ratio, strained)
+        return Clinging(torch.where(chosen, lines, scatter), ratio, strained)
     index = certain.nonzero()[:, 0]
-    more, strained = explained(each(lambda value: value[index], all_of_it), reference.grid.blocks)
+    lines, strained = explained(each(lambda value: value[index], all_of_it), reference.grid.blocks)
     none = scatter.new_zeros(len(scatter), 3, 3)
     strained = None if strained is None else none.index_copy(0, index, strained)
-    return Clinging(scatter.index_copy(0, index, more), ratio, strained)
+    return Clinging(scatter.index_copy(0, index, lines), ratio, strained)
 
 
 def scale_of(grid: Grid, normal: Normal) -> Tensor | None:

@@ -49,30 +49,29 @@ def sandwich(noise: Noise, normal: Normal, interpolation: str = "") -> Sandwich:
 
 def pose_covariance(
     known: Sandwich,
-    variance: Tensor,
+    white: Tensor,
     power: Tensor,
     bias: Tensor,
     scatter: Tensor | None = None,
     coherent: Tensor | None = None,
 ) -> Tensor:
-    """Covariance (B, 3, 3) of poses when one frame's noise has a ``variance`` (B,) and the frame's part of it is seen
-    with a gain of the square ``power`` (B,).
+    """Covariance (B, 3, 3) of poses when one frame's noise has a variance v and is seen with a gain whose square is the
+    ``power`` (B,): v over that is the ``white`` (B,) noise.
 
     Sandwich of the instrumental-variable estimate, v S^-1 (P / gain^2 + P_t) S^-T with P = Z~ Z~^T. The template's
     noise, of variance ``bias`` (B,), is taken out of S, and out of P for its own part P_t: a derivative is
     antisymmetric, so that noise times its own derivative sums to nothing. ``scatter`` (B, 1, 3): how many times what
     white noise would do each row of K feels, see ``clinging``; ``coherent`` (B, 1, 1): see ``coherence``.
     """
-    variance, power, bias = (value.view(-1, 1, 1) for value in (variance, power, bias))
+    white, power, bias = (value.view(-1, 1, 1) for value in (white, power, bias))
     bread = torch.addcmul(known.bread, bias, known.bread_bias, value=-1)
     cofactors = torch.linalg.cross(bread, torch.addcmul(known.next, bias, known.next_bias, value=-1))
     determinant = torch.bmm(bread, cofactors.mT)[:, 1:2, 2:]  # the inverse is their transpose over it
-    meat = torch.addcmul(known.meat, power, known.placed)  # all times gain^2
-    meat = torch.addcmul(meat, power * bias, known.meat_bias, value=-1)
-    white = variance / power
+    placed = torch.addcmul(known.placed, bias, known.meat_bias, value=-1)
+    meat = torch.addcmul(known.meat, power, placed)  # all times gain^2
     root = (white if scatter is None else scatter * white).sqrt() / determinant
     half = cofactors * root
-    rest = known.place if coherent is None else torch.addcmul(known.place, known.alias, coherent.square())
+    rest = known.place if coherent is None else torch.addcmul(known.place, known.alias, coherent * coherent)
     return torch.baddbmm(rest, torch.bmm(half.mT, meat), half)
 
 

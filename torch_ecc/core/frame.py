@@ -113,3 +113,8 @@ def as_mask(where: str, mask: object, batch: int, size: tuple[int, int]) -> Tens
 
 def _range(values: Tensor) -> str:
     return f"values from {values.min():g} to {values.max():g}"
+
+
+def shape_in_words(shape: tuple[int, ...]) -> str:
+    """What images (B, 1, H, W) are."""
+    return f"{shape[0]} image{'s' if shape[0] > 1 else ''} of {shape[3]}x{shape[2]} px"

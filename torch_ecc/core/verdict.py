@@ -128,16 +128,16 @@ def judge(
     ``origin`` (B, 3), by default the start. ``push``: what tells texture from noise."""
     normal, total, pose, axes = found.normal, found.total, found.pose, turn(found.pose.select(1, 2))
     constant = known(reference, normal, settings.interpolation)
-    power, error, score = found.gain.square(), total.select(1, 6), correlation(normal, total)
+    power, error, score = found.gain * found.gain, total.select(1, 6), correlation(normal, total)
     # One image's noise v: of the residuals' mean square the template's part is gain^2 v / frames, the frame's, sampled,
     # NG v.
     variance = error / torch.addcmul(constant.free, power, constant.template_free)
-    of_template = variance * constant.per_frame
+    of_template, seen = variance * constant.per_frame, variance / power
     (bias, most), white = biases(reference, found, constant, of_template), torch.addcmul(variance, of_template, power)
     clings = clinging(reference, found, white, constant.clusters)
     coherent = None if settings.interpolation not in reference.noise.alias else coherence(axes, reference.grid.sides)
-    covariance = pose_covariance(constant.sandwich, variance, power, bias, clings.scatter, coherent)
-    unseen = hidden(reference, found, variance / power), unlike(reference, found, score, clings)
+    covariance = pose_covariance(constant.sandwich, seen, power, bias, clings.scatter, coherent)
+    unseen = hidden(reference, found, seen), unlike(reference, found, score, clings)
     unobservable = largest_variance(reference.place.lever2, covariance), constant.share * most
     visible, believed = seen_and_believed(reference, found)
     share, on_cpu = normal.noise_share * variance, is_cpu(pose.device)

@@ -69,8 +69,9 @@ class Look:
 
     def recordable(self, image: Tensor) -> bool:
         """Whether there are CUDA graphs where it is, and nobody asks for more than values."""
-        wanted = implicit.wanted(self.references[0], image, self.state["pose"])
-        return has_graphs(image.device) and not wanted and not torch.compiler.is_compiling()
+        if not has_graphs(image.device) or torch.compiler.is_compiling():
+            return False
+        return not implicit.wanted(self.references[0], image, self.state["pose"])
 
     def made(self, image: Tensor, images: list[Tensor], put_off: bool = False) -> Result:
         """Coarse to fine."""

@@ -278,8 +278,8 @@ class Recovery:
     def not_led_away(self, estimate: Estimate, start: Tensor, past: Past) -> Estimate:
         """The ``estimate`` in which those templates are lost that were tracked away from where they were expected, or
         to where nobody has seen them go, and that look-alikes may have led there."""
-        x, y, theta = (estimate.pose - start).abs_().amax(0).tolist()
-        if math.hypot(x, y) + self.farthest * theta <= BASIN and max(past.since.tolist()) == 1:
+        each = zip((estimate.pose - start).tolist(), past.since.tolist(), strict=True)
+        if all(since == 1 and math.hypot(x, y) + self.farthest * abs(q) <= BASIN for (x, y, q), since in each):
             return estimate  # as in most frames, of which this is to be seen at once
         radius = self.reference.place.radius
         far = pose_distance(estimate.pose, start, radius=radius) > BASIN

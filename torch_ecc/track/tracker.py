@@ -10,10 +10,11 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from torch_ecc.core.ambient import lasting, plain, threads_for
+from torch_ecc.core.ambient import lasting, plain, threads_for, unrecorded
 from torch_ecc.core.criteria import Criterion, make_criterion, named
 from torch_ecc.core.estimate import Estimate, Reason, Status, Track
-from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor
+from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor, shape_in_words
+from torch_ecc.core.native.engine import DEGREE, code_of
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
 from torch_ecc.core.pyramid import check_levels, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
@@ -310,14 +311,17 @@ class Tracker(nn.Module):
         but for those that a search has found; the tracker's state does not. Raises ValueError for another shape, a
         wrong dtype, NaN.
         """
+        own = code_of(self.criterion) is None or self.settings.interpolation not in DEGREE  # which may use autograd
+        follow = self._forward if own or getattr(frame, "requires_grad", True) else unrecorded(self._forward)
         with threads_for(self.template.numel()):
-            return self._forward(frame)
+            return follow(frame)
 
     def _forward(self, frame: Tensor) -> Estimate:
         state: Any = self._buffers  # a module's attributes are slow
         image = as_image("track", "frame", frame, state["pose"].device)
         if image.shape != self.frame_shape:
-            raise ValueError(f"track: frame must be {_words(self.frame_shape)} as the first, got {_words(image.shape)}")
+            first, other = shape_in_words(self.frame_shape), shape_in_words(image.shape)
+            raise ValueError(f"track: frame must be {first} as the first, got {other}")
         if self.learns and self.template._version != self._version:  # by another handle of the same state
             self._use(self._prepared(self._buffers))
         image = image if self.dead is None else self.dead.repair(image)
@@ -394,7 +398,3 @@ class Tracker(nn.Module):
         if not estimates:
             raise ValueError("track_sequence: frames must hold at least one frame, got none")
         return Track.stack(estimates)
-
-
-def _words(shape: tuple[int, ...]) -> str:
-    return f"{shape[0]} image{'s' if shape[0] > 1 else ''} of {shape[3]}x{shape[2]} px"

@@ -117,21 +117,19 @@ class Marks:
     def __call__(self, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor | None) -> tuple[Estimate, bool]:
         """The ``estimate`` of an ``image`` (1, 1, H, W), from the ``start`` (R, 3) on, in which there is more left of
         those that are ``odd`` (R,) bool, None for none, than any noise leaves; and whether there are new marks."""
-        found = self.found(image, estimate, start, odd)
-        if found is None:
+        if odd is None or not bool(odd.any()):
+            self.state["fitted"].copy_(estimate.pose.detach())
             return estimate, False
+        found = self.found(image, estimate, start, odd)
         estimate = estimate._replace(covariance=estimate.covariance + found.doubt)
         for r, other in found.instead.items():
             estimate = estimate.put(torch.tensor([r], device=start.device), other)
         return estimate, found.new
 
     @torch.no_grad()
-    def found(self, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor | None) -> Found | None:
-        """None if nothing tells of marks."""
+    def found(self, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor) -> Found:
+        """What tells of marks, if any of the templates is ``odd`` (R,)."""
         watch, pose = Watch.of(self.state), estimate.pose.detach()
-        if odd is None or not bool(odd.any()):
-            watch.fitted.copy_(pose)
-            return None
         watch.fitted.copy_(torch.where(odd[:, None], watch.fitted, pose))
         home, radius = self.state["start"], self.reference.place.radius
         moved, fitted = (pose_distance(there, home, radius=radius) for there in (pose, watch.fitted))

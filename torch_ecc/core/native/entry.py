@@ -37,7 +37,7 @@ def call(
     Raises ValueError, MemoryError.
     """
     (many, channels, height, width), results, some = image.shape, packed.results, (0, 0)
-    count = len(results[0])
+    count = solved = results[0].shape[0]
     if start.shape != results[0].shape or channels != 1 or many not in {1, count}:
         raise ValueError(
             f"solve: expected start ({count}, 3), image (1 or {count}, 1, H, W), got {start.shape}, {image.shape}"
@@ -47,13 +47,13 @@ def call(
     if trust is None:
         results = [torch.empty_like(result) for result in results]  # the fastest way to a tensor
     else:
-        some = _places(trust, results[4])
-        results = [result.new_empty((len(trust.which), *result.shape[1:])) for result in results]
+        some, solved = _places(trust, results[4]), len(trust.which)
+        results = [result.new_empty((solved, *result.shape[1:])) for result in results]
     record = CALL.pack(
         *(image.data_ptr(), image.element_size(), height, width, image.stride(2), next_frame),
-        *(start.data_ptr(), *some, _bent(distortion, len(start))),
+        *(start.data_ptr(), *some, _bent(distortion, count)),
         *[result.data_ptr() for result in results],
-        *(len(results[0]), threads_for(len(results[0]) * packed.pixels), *how),
+        *(solved, threads_for(solved * packed.pixels), *how),
     )
     partial = library.solve(record + packed.memory)
     if partial < 0:
@@ -65,7 +65,7 @@ def frames_of(image: Tensor) -> tuple[Tensor, int]:
     """Frames (I, 1, H, W) of whole rows, and how many pixels it is from one to the next, 0 if there is one."""
     if image.stride(3) != 1 or image.is_neg():
         image = image.resolve_neg().contiguous()
-    return image, image.stride(0) if len(image) > 1 else 0
+    return image, image.stride(0) if image.shape[0] > 1 else 0
 
 
 def threads_for(pixels: int) -> int:
