@@ -477,6 +477,21 @@ def test_motion_jpeg_is_read_as_its_pictures_would_be(tmp_path):
     assert "cannot be decoded" in damaged.damage
 
 
+def test_motion_jpeg_that_was_grey_is_in_colour_soon_after_it_shows_some(tmp_path):
+    """And for good; its grey levels are there at once, and a picture that is asked for alone is what it is."""
+    rng = np.random.default_rng(0)
+    colours = cv2.resize(rng.integers(0, 256, (6, 8, 3), np.uint8), (64, 48), interpolation=cv2.INTER_CUBIC)
+    grey, coloured = (cv2.imencode(".jpg", each)[1].tobytes() for each in (np.zeros_like(colours) + 90, colours))
+    write_jpegs(tmp_path / "v.mkv", [grey] * 5 + [coloured] * 30 + [grey])
+    source = open_frames(tmp_path / "v.mkv")
+    frames = list(source)
+    shown = [frame.picture().dim() == 3 for frame in frames]
+    assert shown == sorted(shown)
+    assert shown[30] > shown[4]
+    assert source[6].picture().dim() == 3
+    assert all(frame.pixels.float().std() > 5 for frame in frames[5:35])
+
+
 def test_a_jpeg_in_a_video_that_claims_another_size_is_damaged(tmp_path):
     """Before its memory is asked for."""
     data = cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes()

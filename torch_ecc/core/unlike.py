@@ -30,7 +30,7 @@ def unlike(reference: Reference, found: Solution, score: Tensor, clings: Clingin
     scatter, ratio, _ = clings
     if scatter is None or ratio is None:
         return None
-    if is_cpu(score.device) and none_at_all(score.tolist(), scatter[:, 0].tolist()):
+    if is_cpu(score.device) and none_at_all(score.tolist(), scatter[:, 0].tolist(), ratio[:, 1:].tolist()):
         return None
     normal, power = found.normal, found.gain.square()
     left = found.total[:, 6] / (power * normal.total).clamp(min=LEAST) - LEAST_UNLIKE * normal.contrast
@@ -40,7 +40,12 @@ def unlike(reference: Reference, found: Solution, score: Tensor, clings: Clingin
     return amount[:, None, None] * (block @ normal.meat @ block.mT)
 
 
-def none_at_all(score: list[float], scatter: list[list[float]]) -> bool:
-    """Whether next to nothing is left of all templates, or it is noise: seen at once, as in most frames."""
-    each = zip(score, scatter, strict=True)
-    return all((1 + LEAST_UNLIKE) * s * s >= 1 or sum(rows) <= CLINGS * len(rows) for s, rows in each)
+def none_at_all(score: list[float], scatter: list[list[float]], lines: list[list[list[float]]]) -> bool:
+    """Whether next to nothing is left of all templates, or it is noise, or it is along one axis: seen at once, as in
+    most frames."""
+    return all(
+        (1 + LEAST_UNLIKE) * s * s >= 1
+        or sum(of_blocks) <= CLINGS * len(of_blocks)
+        or sum(map(min, rows, columns)) <= len(rows)
+        for s, of_blocks, (rows, columns) in zip(score, scatter, lines, strict=True)
+    )

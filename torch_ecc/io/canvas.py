@@ -10,7 +10,7 @@ from functools import cache
 from itertools import repeat
 from math import ceil, floor
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ Colour: TypeAlias = tuple[int, int, int]
 WHITE: Colour = (245, 245, 245)
 _DARK: Colour = (20, 20, 20)
 _SMALLEST = 400  # px: smaller frames are enlarged
+_UNSEEN = 0.125  # px, of a path: points nearer to the line between others
 _SHIFT, _FAR = 4, 1 << 20  # lines are placed to 1/16 px, up to where OpenCV's integers end
 
 
@@ -59,14 +60,18 @@ class Stretch(NamedTuple):
     def apply(self, frame: Tensor) -> NDArray[np.uint8]:
         """(H, W) or (C, H, W) -> (H, W, 3) in OpenCV's order."""
         pixels = frame.detach().cpu().numpy()
-        if pixels.dtype != np.uint8:
-            scale = 255.0 / (self.high - self.low)
-            above = np.fmax(pixels, np.asarray(self.low).astype(pixels.dtype))  # of NaN and a number the number
-            pixels = cv2.convertScaleAbs(above, alpha=scale, beta=-self.low * scale)
-        if pixels.ndim == 3 and len(pixels) == 3:
+        if coloured := pixels.ndim == 3 and len(pixels) == 3:
             rows = np.ascontiguousarray(np.moveaxis(pixels, 0, -1))  # no copy where they were so stored
-            return np.asarray(cv2.cvtColor(rows, cv2.COLOR_RGB2BGR), np.uint8)
-        return np.asarray(cv2.cvtColor(pixels.reshape(pixels.shape[-2:]), cv2.COLOR_GRAY2BGR), np.uint8)
+        else:
+            rows = pixels.reshape(pixels.shape[-2:])
+        rows = rows if rows.dtype == np.uint8 else self._in_8_bits(rows.reshape(len(rows), -1)).reshape(rows.shape)
+        return np.asarray(cv2.cvtColor(rows, cv2.COLOR_RGB2BGR if coloured else cv2.COLOR_GRAY2BGR), np.uint8)
+
+    def _in_8_bits(self, rows: NDArray[Any]) -> NDArray[Any]:
+        scale, whole = 255.0 / (self.high - self.low), rows.dtype.kind in "iu"
+        low: Any = self.low if whole else np.asarray(self.low).astype(rows.dtype)
+        above = cv2.max(rows, low) if whole else np.fmax(rows, low)  # of NaN and a number the number
+        return cv2.convertScaleAbs(above, alpha=scale, beta=-self.low * scale)
 
 
 class Canvas:
@@ -87,8 +92,13 @@ class Canvas:
 
     def place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Frame pixels to canvas pixels, (..., 2): both count from the middle of their first pixel."""
-        placed: NDArray[np.float64] = (points + 0.5) * self._zoom - 0.5
+        placed: NDArray[np.float64] = points if self._zoom == 1 else (points + 0.5) * self._zoom - 0.5
         return placed
+
+    def path(self, points: NDArray[np.float64], colour: Colour) -> None:
+        """A line through many (N, 2) frame points, by no more of them than one sees."""
+        few = cv2.approxPolyDP(points.astype(np.float32), _UNSEEN / self._zoom, False)
+        self.lines([few[:, 0].astype(np.float64)], colour)
 
     def lines(
         self, points: Sequence[NDArray[np.float64]], colour: Colour, *, closed: bool = False, width: float = 1.0

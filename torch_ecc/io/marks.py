@@ -79,7 +79,7 @@ def draw(canvas: Canvas, mark: Mark, count: int) -> None:
         canvas.lines([mark.on_frame(line) for line in mark.outlines], mark.colour, closed=True)
         return
     if len(mark.trail) > 1:
-        canvas.lines([np.array(tuple(mark.trail))], _TRAIL)
+        canvas.path(np.array(tuple(mark.trail)), _TRAIL)
     canvas.lines([mark.on_frame(line) for line in mark.outlines], mark.colour, closed=True, width=1.5)
     reach = float(np.vstack(mark.outlines).max(0).min())
     canvas.lines([mark.on_frame(axis) for axis in _cross(max(0.12 * reach, 4 * canvas.step))], mark.colour)

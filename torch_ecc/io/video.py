@@ -16,7 +16,7 @@ from av.video.plane import VideoPlane
 from av.video.reformatter import ColorRange, VideoReformatter
 
 from torch_ecc.io.frames import FrameError, Medium, Pixels, Raw, brief, check_size
-from torch_ecc.io.jpeg import Jpeg, grey, is_plain
+from torch_ecc.io.jpeg import Jpeg, Tint, grey, is_plain
 
 _KINDS = "3gp asf avi dv flv h264 hevc ivf m2ts m4v mjpeg mjpg mkv mov mp4 mpeg mpg mts mxf nut ogv ts vob webm wmv y4m"
 VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
@@ -25,8 +25,7 @@ _STRICT = {"err_detect": "explode"}  # a frame that is damaged is told, and not 
 _PACKED = {"yuyv422": 0, "yvyu422": 0, "uyvy422": 1}  # where the first luma byte stands among chroma bytes
 
 _PLANAR = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p")
-_NEUTRAL = np.uint8(127), 2  # chroma from that to so much more, as coders round it, is grey
-_FULL = ((np.arange(256) - 16) * (255 / 219)).round().clip(0, 255).astype(np.uint8)  # of luma from 16 to 235
+_NEUTRAL = 127, 129  # chroma within that, as coders round it, is grey
 
 _conversion = threading.local()  # to colours: made once for a thread, and not, six times as dear, for each frame
 
@@ -120,7 +119,7 @@ def _decoded(
     """Time and frame, or the reason why there is none, in the order of their times. A damaged frame takes those with it
     that are predicted from it, up to the next one that stands by itself."""
     damaged: list[tuple[float, str]] = []
-    tainted = False
+    tainted, tint = False, Tint()
     # AVI tells when frames are decoded and not when they are shown; FFmpeg guesses that, up to one dropped frame off.
     # The k-th frame to be shown is so at the k-th of these times.
     slots: deque[float] = deque()
@@ -132,7 +131,7 @@ def _decoded(
             if guessed and packet.dts is not None:
                 slots.append(float(packet.dts * packet.time_base))
             try:
-                found = None if plain is None else grey(packet, *plain)
+                found = None if plain is None else grey(packet, *plain, tint)
                 frames = packet.decode() if found is None else [found]
             except av.FFmpegError as error:
                 when = float((packet.pts or 0) * packet.time_base) if not slots else slots.pop()
@@ -190,11 +189,13 @@ def _shown(frame: av.VideoFrame) -> Pixels:
     if frame.format.name not in _PLANAR or frame.planes[0].line_size < 0:
         return _rgb(frame)
     luma, *chroma = (_bytes(plane) for plane in frame.planes)
-    least, more = _NEUTRAL
-    if any((plane - least > more).any() for plane in chroma):
+    least, most = _NEUTRAL
+    if any(plane.min() < least or plane.max() > most for plane in chroma):
         return _rgb(frame)
-    full = frame.format.name.startswith("yuvj") or frame.color_range == ColorRange.JPEG
-    return luma if full else np.asarray(cv2.LUT(luma, _FULL), np.uint8)
+    if frame.format.name.startswith("yuvj") or frame.color_range == ColorRange.JPEG:
+        return luma
+    above: Any = 16.0
+    return cv2.convertScaleAbs(cv2.subtract(luma, above), alpha=255 / 219)  # of luma from 16 to 235
 
 
 def _bytes(plane: VideoPlane) -> Pixels:
