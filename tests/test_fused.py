@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -95,14 +96,33 @@ def test_it_gives_what_the_page_gives(kind, which):
 
 
 def test_some_of_many_are_solved_as_they_are_alone():
-    """Those that trust is about, in its order."""
+    """Those that trust is about, in its order, and that are asked for."""
     reference, image, start = on(*Problem((13, 17), 4, seed=4).made(CRITERIA[1]))
-    index = torch.tensor([3, 0, 3], device=ON)
+    index, asked = torch.tensor([3, 1, 0, 3], device=ON), torch.tensor([True, False, True, True], device=ON)
     blocks = trusted(reference, 1)[index]
-    found = fused.solve(reference, image, start, Settings(), Trust(index, blocks))
+    found = fused.solve(reference, image, start, Settings(), Trust(index, blocks, asked))
+    index, blocks = index[asked], blocks[asked]
     exact = page(reference.select(index), image[index], start[index], Settings(), blocks)
-    torch.testing.assert_close(found.pose, exact.pose, atol=1e-5, rtol=0)
-    torch.testing.assert_close(found.sums[:, 0], exact.sums[:, 0])
+    torch.testing.assert_close(found.pose[asked], exact.pose, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.sums[asked, 0], exact.sums[:, 0])
+
+
+def test_who_is_pushed_is_whole():
+    """Where nobody's trust is less, those that are asked for are solved as if there were none."""
+    reference, image, start = on(*Problem((13, 17), 2, seed=5).made(CRITERIA[0]))
+    asked, once = torch.tensor([False, True], device=ON), Settings(max_iterations=1)
+    found = fused.solve(reference, image, start, once, Trust(torch.arange(2, device=ON), None, asked))
+    exact = page(reference, image, start, once)
+    torch.testing.assert_close(found.pose[1], exact.pose[1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.normal.bread[1], exact.normal.bread[1])
+
+
+def test_records_with_constants_are_arguments():
+    """As the value of a variable they would hold numbers: slower, and an error before Triton 3.8."""
+    for path in Path(fused.__file__).parent.glob("*.py"):
+        assert not re.search(r"^ +\w+ = (Pixels|View|Grids|Frames|Way|Trusted)\(", path.read_text("utf-8"), re.M), (
+            path.name
+        )
 
 
 def test_align_with_it():
