@@ -77,7 +77,7 @@ def test_marks_bring_a_pose_into_doubt_where_nobody_asks_for_them(mark: str) -> 
 
 
 def test_a_coder_near_home_is_no_mark() -> None:
-    """What JPEG leaves stands still while the target next to does, and has no gradient that a move would have."""
+    """What JPEG leaves stands still while the target nearly does, and has no gradient that a move would have."""
     motion = path(6, 0.2)
     frames = [cv2.imdecode(cv2.imencode(".jpg", f.numpy(), JPEG)[1], cv2.IMREAD_GRAYSCALE) for f in filmed(motion)]
     track = Tracker(torch.from_numpy(frames[0]), CENTER, SIZE).track_sequence(map(torch.from_numpy, frames[1:]))
