@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 
-import cv2
 import pytest
 import torch
 from torch import Tensor
@@ -21,7 +20,6 @@ SHOWN = {
     "stripe": (X + 0.2 * Y - 100).abs() > 5,
     "dust": ((X % 40 - 20).square() + (Y % 40 - 20).square()) > 10,
 }
-JPEG = [cv2.IMWRITE_JPEG_QUALITY, 70]
 marks = pytest.mark.parametrize("mark", SHOWN)
 
 
@@ -74,15 +72,6 @@ def test_marks_bring_a_pose_into_doubt_where_nobody_asks_for_them(mark: str) -> 
     assert not ((error > far) & (error > 5 * track.sigma[:, 0])).any()
     assert error[2:, :2].max() < 0.5
     assert (torch.linalg.eigvalsh(track.covariance) > 0).all()
-
-
-def test_a_coder_near_home_is_no_mark() -> None:
-    """What JPEG leaves stands still while the target nearly does, and has no gradient that a move would have."""
-    motion = path(6, 0.2)
-    frames = [cv2.imdecode(cv2.imencode(".jpg", f.numpy(), JPEG)[1], cv2.IMREAD_GRAYSCALE) for f in filmed(motion)]
-    track = Tracker(torch.from_numpy(frames[0]), CENTER, SIZE).track_sequence(map(torch.from_numpy, frames[1:]))
-    assert (track.sigma[:, 0, :2] < 0.05).all()
-    assert (off(track, motion) < 4 * track.sigma[:, 0]).all()
 
 
 def test_marks_cost_no_gradient() -> None:

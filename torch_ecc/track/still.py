@@ -27,7 +27,7 @@ from torch_ecc.core.normal import LEAST
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference, each, reweigh
 from torch_ecc.core.robust import LEAST_NOISE, Memory, unusual
-from torch_ecc.core.sampling import Sampler, inside, make_sampler
+from torch_ecc.core.sampling import Sampler, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import eroded, picked, seen_through
 from torch_ecc.core.verdict import expected_score, within_margin
@@ -40,8 +40,6 @@ CONTRAST = 0.2  # of the template's, must be left by the template, which light a
 BELIEVED = 0.95  # of what is in sight must fit without the marks
 BY_CHANCE = 3.0  # standard deviations of what noise may leave
 QUIET, TO_MEAN = 0.3, 1.41  # a quantile of what noise leaves of squares, and their mean over it
-SHORT = 2.0  # by so much a step may be too short that leads far
-CLINGS = 4.0  # times what white noise would do: so much may residuals do that cling together
 UNSEEN = 1.0  # px: what holds it back by more has been told before, as a mark
 ROUNDS = 3  # in which they are told from poses that they bend less and less
 
@@ -253,9 +251,9 @@ class Still(NamedTuple):
         return self.told(trial.estimate.pose, trial.reference)
 
     def doubt(self, pose: Tensor, trusted: Tensor) -> Tensor:
-        """By what (1, 3, 3) it may be off at a ``pose`` (1, 3) if all that stands still is no part of it: as far as the
-        others, in blocks that are ``trusted`` (1, blocks), have it elsewhere, and as uncertain as what is left of them
-        makes that; no more than it may have moved unseen. Nothing where no more is left of them than noise."""
+        """By what (1, 3, 3) it may be off at a ``pose`` (1, 3) if all that stands still is no part of it: a covariance
+        of as much as leaves what is left of the others in blocks that are ``trusted`` (1, blocks), and more than noise;
+        no more than it may have moved unseen."""
         seen, reference, axes = look(self, pose, self.reference), self.reference, turn(pose[:, 2])
         warps = reference.warps(torch.cat((pose, self.home)))
         now, home = (warps - shift(*seen.corner, warps)).split(1)
@@ -266,13 +264,9 @@ class Still(NamedTuple):
         if len(left) == 0:
             return torch.zeros_like(axes)
         noise = left.quantile(QUIET).mul(TO_MEAN).clamp(max=seen.noise)  # the estimate is an upper one
-        if float((left - noise).sum() - BY_CHANCE * noise * (2 * len(left)) ** 0.5) <= 0:
-            return torch.zeros_like(axes)
-        others = reweigh(reference, moving)
-        g = make_sampler("bspline3", self.image.float(), warps[:1], reference.grid.box)(warps[:1], pixels)
-        step = others.criterion.step(others, g).to(pose).nan_to_num(UNSEEN, UNSEEN, UNSEEN)
-        half = others.normal.inverse[:, :3, :3]
-        scatter = half @ others.normal.meat @ half.mT * (CLINGS * left.mean())
-        doubt: Tensor = axes @ (SHORT**2 * step[:, :, None] * step[:, None] + scatter) @ axes.mT
+        more = (left - noise).sum() - BY_CHANCE * noise * (2 * len(left)) ** 0.5
+        normal = reweigh(reference, moving).normal
+        half = axes @ normal.inverse[:, :3, :3]
+        doubt: Tensor = half @ normal.meat @ half.mT * more.clamp(min=0)
         most = largest_variance(reference.place.lever2, doubt)
         return doubt * (UNSEEN**2 / most.clamp(min=UNSEEN**2)).view(-1, 1, 1)
