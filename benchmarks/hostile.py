@@ -115,6 +115,10 @@ def sensors() -> dict[str, Row]:
         "fixed dust that is found": partial(cameras.dust, known="find"),
         "fixed stripe, faint": partial(cameras.stripe, opacity=0.3),
         "fixed dust, faint": partial(cameras.dust, opacity=0.3),
+        **{
+            f"fixed {one.__name__}, JPEG 70": partial(cameras.coded, one=one)
+            for one in (cameras.aperture, cameras.stripe)
+        },
         "fixed pattern": cameras.fixed_pattern,
         "noise in rows": partial(cameras.lined, across=False),
         "noise in columns": partial(cameras.lined, across=True),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -49,6 +50,12 @@ def dust(shot: Shot, opacity: float = 1.0, grains: int = 10, known: str = "") ->
     u = torch.rand(grains, 3, generator=torch.Generator().manual_seed(shot.seed)) - 0.5
     off = [3.5 + 3 * r - torch.hypot(x - shot.size * a, y - shot.size * b) for a, b, r in u.tolist()]
     return shut(shot, opacity * torch.stack(off).amax(0).clamp(0, 1), known)
+
+
+def coded(shot: Shot, one: Callable[[Shot], Film], quality: int = 70) -> Film:
+    """The frames of another film as a coder leaves them."""
+    film = one(shot)
+    return film._replace(frames=jpeg(film.frames, quality))
 
 
 def fixed_pattern(shot: Shot, sigma: float = 4.0) -> Film:
