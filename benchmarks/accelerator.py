@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import click
 import torch
+from command import write_video
 from results import save
 from rich.console import Console
 from scaling import SCENE, spread
@@ -171,7 +172,7 @@ def cases(counts: Some[int], sizes: Some[int], ways: Some[str]) -> list[Case]:
     ]
     every.sort(key=lambda case: (case.count, case.size) != (counts[-1], sizes[-1]))
     last = [Case(counts[-1], sizes[-1], "bspline3", way) for way in ways if way == "compiled"]
-    return [*every, Case(counts[-1], sizes[-1], "bspline3", first[0], robust=True), *last]
+    return [*every, Case(counts[-1], sizes[-1], "bspline3", ways[0], robust=True), *last]
 
 
 def measure(case: Case, frames: list[Tensor], place: torch.device, iterations: int) -> tuple[float, float, int]:
@@ -264,16 +265,16 @@ def tracked(frames: list[Tensor], place: torch.device, count: int, size: int, co
 
 
 def from_video(frames: list[Tensor], place: torch.device, count: int, size: int) -> list[Number]:
-    """Frames per second from an H.264 file to poses; nothing where PyAV is not there."""
-    try:
-        from torch_ecc.io import open_frames
-        from torch_ecc.io.overlay import OverlayWriter  # noqa: F401 - which needs PyAV
-    except ImportError as error:
-        console.print(f"from an H.264 file: not measured ({error})")
-        return []
+    """Frames per second from an H.264 file to poses; nothing where something that it takes is not there."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "moving.mp4"
-        written(path, frames)
+        try:
+            from torch_ecc.io import open_frames
+
+            write_video(path, "h264", (frame.cpu().numpy() for frame in frames))
+        except ImportError as error:
+            console.print(f"from an H.264 file: not measured ({error})")
+            return []
         first, *_ = open_frames(path)
         tracker = Tracker(first.pixels, spread(count, size + 40, FRAME).round(), size, device=place)
         taken = seconds(place, lambda: [tracker(frame.pixels) for frame in open_frames(path)], 2) / len(frames)
@@ -282,23 +283,17 @@ def from_video(frames: list[Tensor], place: torch.device, count: int, size: int)
     return [Number(name, 1 / taken, "frames/s", "higher", 0.3)]
 
 
-def written(path: Path, frames: list[Tensor]) -> None:
-    """An H.264 file of frames (H, W)."""
-    import av
-
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=60, options={"crf": "10"})
-        stream.height, stream.width = frames[0].shape
-        stream.pix_fmt = "yuv420p"
-        for frame in frames:
-            picture = av.VideoFrame.from_ndarray(frame.byte().cpu().numpy(), "gray")
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode())
-
-
 def numbers(_: click.Context, __: click.Parameter, value: str | None) -> list[int] | None:
     """Of a list with commas."""
     return None if value is None else [int(v) for v in value.split(",")]
+
+
+def ways_of(_: click.Context, __: click.Parameter, value: str | None) -> list[str]:
+    """Those of a list with commas, by default all."""
+    ways = list(WAYS) if value is None else value.split(",")
+    if unknown := [way for way in ways if way not in WAYS]:
+        raise click.BadParameter(f"expected some of {', '.join(WAYS)}, got {', '.join(unknown)}")
+    return ways
 
 
 @click.command()
@@ -308,7 +303,7 @@ def numbers(_: click.Context, __: click.Parameter, value: str | None) -> list[in
 @click.option("--frames", default=10, show_default=True)
 @click.option("--iterations", default=8, show_default=True)
 @click.option("--minutes", default=7.0, show_default=True, help="begin nothing after so many")
-@click.option("--ways", help=f"some of {', '.join(WAYS)} [default: all there are]")
+@click.option("--ways", callback=ways_of, help=f"some of {', '.join(WAYS)} [default: all there are]")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
 @torch.no_grad()
 def main(
@@ -318,19 +313,21 @@ def main(
     frames: int,
     iterations: int,
     minutes: float,
-    ways: str | None,
+    ways: list[str],
     out: Path | None,
 ) -> None:
     """Poses per second, share of the roofline, agreement with the CPU."""
     place, end = torch.device(device), time.monotonic() + 60 * minutes
     counts = counts or ([1, 64, 1024, 4096, 16384] if place.type == "cuda" else [1, 16])
-    every = [*THERE.get(place.type, ["eager"]), "compiled"]
-    chosen = every if ways is None else [way for way in every if way in ways.split(",")]
+    there = [*THERE.get(place.type, ["eager"]), "compiled"]
+    ways = [way for way in there if way in ways]
+    if not ways:
+        raise click.UsageError(f"--ways: expected some that {place.type} has: {', '.join(there)}")
     shots = Sequence(SCENE, Harmonic(6.0, 1.0, frames + 1).closed(), Camera())
     views, rate = [view[None].to(place) for view in shots], copy_rate(place)
     console.print(f"{card(place)}: copies {rate / 1e9:.1f} GB/s; {len(views) - 1} frames, {iterations} iterations")
-    figures, left = [Number("copy rate", rate / 1e9, "GB/s", "higher")], cases(counts, sizes, chosen)
-    engines = dict.fromkeys(backend for backend, _ in (WAYS[way] for way in chosen))
+    figures, left = [Number("copy rate", rate / 1e9, "GB/s", "higher")], cases(counts, sizes, ways)
+    engines = dict.fromkeys(backend for backend, _ in (WAYS[way] for way in ways))
     some = {counts[0], min(counts[-1], CHECKED)} if minutes > 0 else ()
     if minutes > 0:
         figures += whole_trackers(place, counts, sizes[-1])

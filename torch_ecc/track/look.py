@@ -51,20 +51,23 @@ class Look:
         and grows to as many levels as there are."""
         if len(self.references) > 1 or not self.recordable(image):
             return self.made(image, images)[:3]
-        kept = [self.state["trust"], self.state["answered"]]
-        before = [part.clone() for part in kept]
+        before = [part.clone() for part in self.kept]
         result = self.graph(image, put_off=self.shutter.line == 0)(image)
         if result[3] is not None and bool(result[3].any()):
-            for part, was in zip(kept, before, strict=True):
+            for part, was in zip(self.kept, before, strict=True):
                 part.copy_(was)
             result = self.graph(image, put_off=False)(image)
         return result[:3]
 
+    @property
+    def kept(self) -> list[Tensor]:
+        """What a look leaves for the next one."""
+        return [self.state["trust"], self.state["answered"]]
+
     def graph(self, image: Tensor, put_off: bool) -> Graph:
         """That for frames like an ``image``."""
         if put_off not in self.graphs or not self.graphs[put_off].fits(image):
-            kept = [self.state["trust"], self.state["answered"]]
-            self.graphs[put_off] = Graph(lambda frame: self.made(frame, [frame], put_off), image, kept)
+            self.graphs[put_off] = Graph(lambda frame: self.made(frame, [frame], put_off), image, self.kept)
         return self.graphs[put_off]
 
     def recordable(self, image: Tensor) -> bool:

@@ -83,7 +83,7 @@ def _grids(packed: Packed, k: int) -> Grids:
 
 
 def _trusted(trust: Trust | None, packed: Packed, start: Tensor) -> Trusted:
-    """All of them, whole, if there is none: then nothing is read of it."""
+    """All of them, whole, if there is none."""
     across, count = -(-packed.widths[0] // BLOCK), packed.results[4].shape[2]
     lines = 1 << (max(across, count // across) - 1).bit_length()
     iterations, none = packed.results[2], packed.tensors[1]  # of the same types: else there would be another kernel
