@@ -20,6 +20,7 @@ from torch_ecc.io import OverlayWriter, open_frames
 from torch_ecc.io.beside import ahead
 from torch_ecc.io.marks import Mark
 from torch_ecc.io.shapes import outlines
+from torch_ecc.io.sinks import open_sink
 
 GREY = torch.full((480, 640), 90, dtype=torch.uint8)
 
@@ -342,3 +343,18 @@ def test_bad_frames(tmp_path, frame, record, message):
         with pytest.raises(ValueError, match=message):
             writer.write(frame, record)
     assert names(tmp_path / "overlay") == {"frame_000000.png"}
+
+
+@pytest.mark.parametrize("size", [(450, 480), (452, 480), (405, 407)], ids=str)
+def test_a_video_shows_what_was_drawn(size, tmp_path):
+    """Brightness and colours, whatever its size."""
+    low = np.random.default_rng(0).integers(40, 200, (6, 6, 3), dtype=np.uint8)
+    drawn = cv2.resize(low, size[::-1], interpolation=cv2.INTER_CUBIC)
+    sink = open_sink(tmp_path, "film", 25.0, 0, as_frames=False)
+    for _ in range(3):
+        sink.write(drawn)
+    with av.open(str(sink.close(keep=False))) as film:
+        shown = [frame.to_ndarray(format="bgr24") for frame in film.decode(video=0)]
+    assert len(shown) == 3
+    apart = shown[-1][: size[0], : size[1]].astype(int) - drawn
+    assert np.abs(apart).mean() < 5

@@ -78,7 +78,9 @@ class _Video:
             picture = np.pad(picture, ((0, bottom), (0, right), (0, 0)), mode="edge")
         self._encoder = self._encoder or self._begin(*picture.shape[:2])
         rows = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), np.uint8)
-        planes = av.VideoFrame.from_numpy_buffer(rows, format="yuv420p")  # not a copy of them
+        # Without a copy PyAV 18 takes planes of any other height for those of one that is a multiple of four.
+        made = av.VideoFrame.from_ndarray if picture.shape[0] % 4 else av.VideoFrame.from_numpy_buffer
+        planes = made(rows, format="yuv420p")
         planes.pts, self._count = self._count, self._count + 1
         self._append(self._encoder.encode(planes))
 
