@@ -31,6 +31,7 @@ from torch_ecc.core.sampling import Sampler, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import eroded, picked, seen_through
 from torch_ecc.core.verdict import expected_score, within_margin
+from torch_ecc.search.locate import pose_distance
 from torch_ecc.track.frame_mask import unexplained
 
 AROUND = 3  # px: pixels are compared in squares of so many
@@ -40,8 +41,13 @@ CONTRAST = 0.2  # of the template's, must be left by the template, which light a
 BELIEVED = 0.95  # of what is in sight must fit without the marks
 BY_CHANCE = 3.0  # standard deviations of what noise may leave
 QUIET, TO_MEAN = 0.3, 1.41  # a quantile of what noise leaves of squares, and their mean over it
+CODED = 2.0  # times what is left of the quieter squares beside noise, as of a coder: it is uneven
+MOST_NOISE = 0.04  # of the template's contrast
+AWAY = 1.0  # px: nearer to where it was, a coder changes edges of marks by more than they change by themselves
+SETTLED = 0.05  # px
+CLEARLY = 3.0  # times as much must be left with the marks
 UNSEEN = 1.0  # px: what holds it back by more has been told before, as a mark
-ROUNDS = 3  # in which they are told from poses that they bend less and less
+ROUNDS = 4  # in which they are told from poses that they bend less and less
 
 
 class Look(NamedTuple):
@@ -75,8 +81,9 @@ class Look(NamedTuple):
         return whole
 
 
-def look(still: Still, pose: Tensor, clean: Reference) -> Look:
-    """At one template at a ``pose`` (1, 3), which is ``clean`` of marks as far as one knows."""
+def look(still: Still, pose: Tensor, clean: Reference, *, through_coder: bool = True) -> Look:
+    """At one template at a ``pose`` (1, 3), which is ``clean`` of marks as far as one knows; a coder may leave more
+    noise than the template shows."""
     reference, (height, width) = still.reference, still.shown.shape
     warps = reference.warps(torch.cat((pose, still.home)))
     x, y = (warps @ reference.grid.box.to(warps.dtype)).round().long().unbind(1)
@@ -91,12 +98,20 @@ def look(still: Still, pose: Tensor, clean: Reference) -> Look:
     left = mean(torch.where(known, left, 0.0).square())
     contrast = float(clean.normal.energy / clean.normal.total)
     noise = 2 * max(float(reference.noise.of_frame), LEAST_NOISE**2 * contrast)
+    if through_coder and bool(known.any()):
+        noise = coded(noise, left[known], variance(expected)[known], MOST_NOISE * contrast)
     changed = mean((view - before).square())
     new = torch.where(changed < STILL * noise, 0.0, left)  # else a mark may have come to be there
     since = composed(now, inverted(home))[None]  # from where a pixel was to where that is now
     own = torch.where(inside(since, pixels, view.shape), picked(new, since, pixels), 0.0).view(view.shape)
-    texture = mean(before.square()) - mean(before).square()
-    return Look((y0, x0), changed, left if still.pure else left.maximum(own), texture, noise, contrast)
+    return Look((y0, x0), changed, left if still.pure else left.maximum(own), variance(before), noise, contrast)
+
+
+def coded(noise: float, left: Tensor, texture: Tensor, most: float) -> float:
+    """The ``noise`` of a difference of two frames, or, at ``most``, what a coder has made of it, if even of the quieter
+    ones of those squares more is ``left`` (n,) whose ``texture`` (n,) is finer than that of others."""
+    own = TO_MEAN * float(left[texture >= texture.median()].quantile(QUIET))
+    return max(noise, min(noise + CODED * (own - noise), most))
 
 
 def shift(y: int, x: int, like: Tensor) -> Tensor:
@@ -150,6 +165,11 @@ def mean(image: Tensor) -> Tensor:
     return F.avg_pool2d(image[None, None], AROUND, 1, AROUND // 2, count_include_pad=False)[0, 0]
 
 
+def variance(image: Tensor) -> Tensor:
+    """Within squares of AROUND px, (h, w)."""
+    return mean(image.square()) - mean(image).square()
+
+
 def behind(reference: Reference, home: Tensor, marks: Tensor, which: Tensor) -> Reference:
     """The templates, cut at ``home`` (B, 3), as a camera sees them that has ``marks`` (H, W), bool: those of them at
     ``which`` (B,) that heed them, in the frame and in what they were cut from."""
@@ -173,20 +193,25 @@ def behind(reference: Reference, home: Tensor, marks: Tensor, which: Tensor) -> 
 
 
 class Trial(NamedTuple):
-    """One template without marks: the ``estimate`` (1, ...), whether it leaves ``odd`` blocks, the ``reference``, and
-    what is ``shown`` (H, W)."""
+    """One template without marks: the ``estimate`` (1, ...), whether it leaves ``odd`` blocks, and how much is ``left``
+    of it, a variance per pixel; the ``reference``, and what is ``shown`` (H, W)."""
 
     estimate: Estimate
     odd: bool
+    left: float
     reference: Reference
     shown: Tensor
 
     @property
+    def known(self) -> bool:
+        """Whether all that is in sight has been found."""
+        return bool((self.estimate.coverage > BELIEVED) & (self.estimate.status == Status.CONVERGED))
+
+    @property
     def fits(self) -> bool:
-        """Whether what is left of it does."""
-        e = self.estimate
-        known = within_margin(e.score, expected_score(self.reference)) & (e.coverage > BELIEVED)
-        return not self.odd and bool(known & (e.status == Status.CONVERGED))
+        """Whether no more is left of it than noise leaves."""
+        score = self.estimate.score
+        return self.known and not self.odd and bool(within_margin(score, expected_score(self.reference)))
 
 
 class Still(NamedTuple):
@@ -215,27 +240,42 @@ class Still(NamedTuple):
             reference, self.image, self.start, replace(self.settings, robust=False), self.home, memory
         )
         odd = bool(unusual(reference, solution, self.settings, memory.score))
-        return Trial(found, odd, reference, shown)
+        left = float(solution.total[:, 6] / solution.total[:, 0].clamp(min=LEAST))
+        return Trial(found, odd, left, reference, shown)
 
-    def fits_at(self, pose: Tensor) -> bool:
-        """Whether it does as it is: then it was looked for at another place, and nothing marks it."""
-        whole = self._replace(start=pose).trial(self.shown)
-        return whole is not None and whole.fits
+    def apart(self, pose: Tensor, other: Tensor) -> float:
+        """Px, of its farthest pixel at poses (1, 3)."""
+        return float(pose_distance(pose, other, radius=self.reference.place.radius))
+
+    def explains(self, trial: Trial, last: Trial | None) -> bool:
+        """Whether a ``trial`` without marks is what it is, and not as well with them, at that place: because it fits,
+        or, as behind a coder nothing does, because the marks told from it lead back to it, as from the ``last`` one,
+        and with them far more is left."""
+        settled = last is not None and self.apart(trial.estimate.pose, last.estimate.pose) < SETTLED
+        if not trial.fits and not (settled and trial.known and self.apart(trial.estimate.pose, self.home) > AWAY):
+            return False
+        there = self._replace(start=trial.estimate.pose)
+        if trial.fits:
+            marked = there.trial(self.shown)
+            return marked is None or not marked.fits
+        marked = there.trial(torch.ones_like(self.shown))
+        return marked is None or marked.left > CLEARLY * trial.left
 
     def told(self, pose: Tensor, clean: Reference) -> Trial | None:
         """Without the marks that are told from a ``pose`` (1, 3) on, and a template that is ``clean`` of them as far as
         one knows; None if it then does not fit."""
+        last = None
         for _ in range(ROUNDS):
             seen = look(self, pose, clean)
             marks = seen.within(seen.marks, self.shown) & self.shown
             trial = self.trial(self.shown & ~marks) if bool(marks.any()) else None
-            if trial is None or (trial.fits and self.fits_at(trial.estimate.pose)):
+            if trial is None or not Status.good(trial.estimate.status):
                 return None
-            if trial.fits:
+            if self.explains(trial, last):
                 return trial
-            if not Status.good(trial.estimate.status):
+            if trial.fits:  # with the marks as well: it was looked for at another place, and nothing marks it
                 return None
-            pose, clean = trial.estimate.pose, trial.reference
+            pose, clean, last = trial.estimate.pose, trial.reference, trial
         return None
 
     def without_marks(self, pose: Tensor) -> Trial | None:
@@ -254,7 +294,8 @@ class Still(NamedTuple):
         """By what (1, 3, 3) it may be off at a ``pose`` (1, 3) if all that stands still is no part of it: a covariance
         of as much as leaves what is left of the others in blocks that are ``trusted`` (1, blocks), and more than noise;
         no more than it may have moved unseen."""
-        seen, reference, axes = look(self, pose, self.reference), self.reference, turn(pose[:, 2])
+        reference, axes = self.reference, turn(pose[:, 2])
+        seen = look(self, pose, reference, through_coder=False)
         warps = reference.warps(torch.cat((pose, self.home)))
         now, home = (warps - shift(*seen.corner, warps)).split(1)
         pixels, size = reference.grid.pixels, seen.left.shape
