@@ -1,0 +1,79 @@
+"""Laws of a camera's fixed pattern: next to where it was cut it holds a template back, and sigma tells."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torch_ecc import Tracker
+from torch_ecc.sim.scene.waves import PlaneWaves
+from torch_ecc.track import pinned
+
+SHAPE, SIZE, HOME = (110, 120), 61, (60.0, 55.0)
+SCENES = 6
+
+
+def poses(moves: Tensor) -> Tensor:
+    """HOME, and then so far (F, 2) px from it: (F + 1, 3)."""
+    moves = torch.cat((torch.zeros(1, 2), moves))
+    return torch.cat((moves + torch.tensor(HOME), torch.zeros(len(moves), 1)), 1).double()
+
+
+def filmed(path: Tensor, seed: int, fixed: float, noise: float) -> Tensor:
+    """Frames (F, H, W) with a ``fixed`` pattern and ``noise``, grey levels, on a contrast of ten."""
+    source = torch.Generator().manual_seed(seed)
+    clean = PlaneWaves.random(seed=seed).render(path, SHAPE)[:, 0].float()
+    clean = 110 + 10 * (clean - clean.mean()) / clean.std()
+    pattern = fixed * torch.randn(SHAPE, generator=source)
+    return (clean + pattern + noise * torch.randn(clean.shape, generator=source)).round().clamp(0, 255).to(torch.uint8)
+
+
+def errors(fixed: float, noise: float) -> tuple[Tensor, Tensor]:
+    """x and y of poses at 0.1 to 1 px, off (n, 2), and their sigma."""
+    path = poses(torch.tensor([[0.1, 0.05], [-0.3, 0.25], [0.6, -0.4], [0.9, 0.5]]))
+    tracks = []
+    for seed in range(SCENES):
+        frames = filmed(path, seed, fixed, noise)
+        tracks.append(Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:]))
+    error = torch.cat([track.pose[:, 0, :2] - path[1:, :2] for track in tracks])
+    return error, torch.cat([track.sigma[:, 0, :2] for track in tracks])
+
+
+def test_sigma_covers_what_a_fixed_pattern_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It pulls to where the template was cut, by many times what noise alone would do."""
+    error, sigma = errors(fixed=3.0, noise=1.5)
+    assert 0.6 < (error / sigma).square().mean().sqrt() < 1.5
+    monkeypatch.setattr("torch_ecc.track.advance.pinned", lambda estimate, *_: estimate)
+    same, alone = errors(fixed=3.0, noise=1.5)
+    assert torch.equal(error, same)
+    assert (error / alone).square().mean().sqrt() > 2.5
+
+
+@pytest.mark.parametrize("noise", [0.5, 2.0, 4.0])
+def test_noise_that_is_new_in_every_frame_is_no_pattern(noise: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sigma is as it was, and hardly larger where noise of less than a grey level cannot be told well."""
+    _, sigma = errors(fixed=0.0, noise=noise)
+    monkeypatch.setattr("torch_ecc.track.advance.pinned", lambda estimate, *_: estimate)
+    more = sigma / errors(fixed=0.0, noise=noise)[1]
+    assert more.min() >= 1
+    assert more.max() <= (1.0 if noise > 1 else 1.5)
+
+
+def test_fine_texture_that_goes_along_is_no_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a template was taken to have of noise is missing from all frames, also far away: from then on it is none."""
+    path = poses(torch.tensor([[0.25, 0.25], [1.2, 0.8], [2.2, 1.6], [3.1, 2.3], [2.3, 1.6], [1.2, 0.8], [0.25, 0.25]]))
+    spectrum = torch.fft.fft2(torch.randn(SHAPE, generator=torch.Generator().manual_seed(0)).double())
+    y, x = (torch.fft.fftfreq(n, dtype=torch.float64) for n in SHAPE)
+    spectrum *= x.square() + y[:, None].square() < 0.35**2
+    dx, dy = (path[:, :2] - torch.tensor(HOME)).unsqueeze(2).unbind(1)
+    phase = torch.exp(-2j * torch.pi * (dx[:, None] * x + dy[:, None] * y[:, None]))
+    shown = (110 + 12 * torch.fft.ifft2(spectrum * phase).real).float()
+    tracker = Tracker(shown[0], [HOME], SIZE)
+    track = tracker.track_sequence(shown[1:])
+    assert bool((track.status == 0).all())
+    assert float(tracker.fixed) == pinned.TEXTURE
+    monkeypatch.setattr("torch_ecc.track.advance.pinned", lambda estimate, *_: estimate)
+    alone = Tracker(shown[0], [HOME], SIZE).track_sequence(shown[1:])
+    assert track.sigma[0, 0, 0] > 1.5 * alone.sigma[0, 0, 0]
+    assert torch.equal(track.sigma[3:], alone.sigma[3:])
