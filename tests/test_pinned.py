@@ -1,4 +1,4 @@
-"""Laws of a camera's fixed pattern: next to where it was cut it holds a template back, and sigma tells."""
+"""Laws of what stays with a camera: it holds a template where that was cut, and sigma tells."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from torch_ecc import Tracker
+from torch_ecc import Track, Tracker
+from torch_ecc.core.align import solve_again
+from torch_ecc.core.leverage import disagreement
+from torch_ecc.core.reference import Reference
+from torch_ecc.core.settings import Settings
+from torch_ecc.core.solution import Solution
 from torch_ecc.sim.scene.waves import PlaneWaves
 from torch_ecc.track import pinned
 
@@ -44,7 +49,7 @@ def test_sigma_covers_what_a_fixed_pattern_does(monkeypatch: pytest.MonkeyPatch)
     """It pulls to where the template was cut, by many times what noise alone would do."""
     error, sigma = errors(fixed=3.0, noise=1.5)
     assert 0.6 < (error / sigma).square().mean().sqrt() < 1.5
-    monkeypatch.setattr("torch_ecc.track.advance.pinned", lambda estimate, *_: estimate)
+    monkeypatch.setattr("torch_ecc.track.advance.held", lambda estimate, *_: estimate)
     same, alone = errors(fixed=3.0, noise=1.5)
     assert torch.equal(error, same)
     assert (error / alone).square().mean().sqrt() > 2.5
@@ -54,7 +59,7 @@ def test_sigma_covers_what_a_fixed_pattern_does(monkeypatch: pytest.MonkeyPatch)
 def test_noise_that_is_new_in_every_frame_is_no_pattern(noise: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sigma is as it was, and hardly larger where noise of less than a grey level cannot be told well."""
     _, sigma = errors(fixed=0.0, noise=noise)
-    monkeypatch.setattr("torch_ecc.track.advance.pinned", lambda estimate, *_: estimate)
+    monkeypatch.setattr("torch_ecc.track.advance.held", lambda estimate, *_: estimate)
     more = sigma / errors(fixed=0.0, noise=noise)[1]
     assert more.min() >= 1
     assert more.max() <= (1.0 if noise > 1 else 1.5)
@@ -73,7 +78,61 @@ def test_fine_texture_that_goes_along_is_no_pattern(monkeypatch: pytest.MonkeyPa
     track = tracker.track_sequence(shown[1:])
     assert bool((track.status == 0).all())
     assert float(tracker.fixed) == pinned.TEXTURE
-    monkeypatch.setattr("torch_ecc.track.advance.pinned", lambda estimate, *_: estimate)
+    monkeypatch.setattr("torch_ecc.track.advance.held", lambda estimate, *_: estimate)
     alone = Tracker(shown[0], [HOME], SIZE).track_sequence(shown[1:])
     assert track.sigma[0, 0, 0] > 1.5 * alone.sigma[0, 0, 0]
     assert torch.equal(track.sigma[3:], alone.sigma[3:])
+
+
+def drifting(seed: int, step: float = 0.06, count: int = 25) -> tuple[Tensor, Tensor]:
+    """A slow drift (F + 1, 3), and its frames (F + 1, H, W) behind a dark stripe and grains of dust: far more contrast
+    than the scene has."""
+    time = torch.arange(1, count + 1, dtype=torch.float32)
+    path = poses(torch.stack((-step * time, 0.5 * step * time), 1))
+    y, x = torch.arange(SHAPE[0])[:, None], torch.arange(SHAPE[1])
+    marks = ((x + 0.2 * y - 78).abs() < 4) | ((x - 45).square() + (y - 40).square() < 12)
+    return path, torch.where(marks, 12 + torch.zeros_like(marks), filmed(path, seed, 0.0, 1.0)).to(torch.uint8)
+
+
+def wrong(track: Track, path: Tensor) -> Tensor:
+    """Which of the frames (F,) are believed 0.1 px off, by more than 5 sigma."""
+    error, sigma = (track.pose[:, 0] - path[1:]).abs()[:, :2], track.sigma[:, 0, :2]
+    return (track.status[:, 0] == 0) & ((error > 0.1) & (error > 5 * sigma)).any(1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sigma_covers_what_a_mark_does_to_a_slow_drift(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before so much is left of any block that it could be told, and between the frames in which one looks for it."""
+    path, frames = drifting(seed)
+    track = Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:])
+    assert not wrong(track, path).any()
+    monkeypatch.setattr("torch_ecc.track.advance.held", lambda estimate, *_: estimate)
+    assert wrong(Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:]), path).any()
+
+
+def effects(reference: Reference, image: Tensor) -> Solution:
+    """Of one look at an ``image`` (1, 1, H, W)."""
+    settings = Settings(backend="torch", max_iterations=20)
+    return solve_again(reference, image, torch.tensor([[*HOME, 0.0]], dtype=torch.float64), settings)[1]
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 4.0])
+def test_blocks_of_high_leverage_disagree_by_what_the_others_have_moved(factor: float) -> None:
+    """Not by noise; of what moves they say a part, and the same in any grey levels."""
+    still, moved = poses(torch.zeros(1, 2))[:1], poses(torch.tensor([[0.2, -0.1]]))[1:]
+    for seed in range(4):
+        first, same = (filmed(still, seed + k, 0.0, 0.0)[0].float() for k in (0, 0))
+        other = filmed(moved, seed, 0.0, 0.0)[0].float()
+        source = torch.Generator().manual_seed(seed)
+        bar = (torch.arange(SHAPE[1]) - 70).abs() < 4
+        noisy = [torch.where(bar, 5.0, v) + 1.5 * torch.randn(SHAPE, generator=source) for v in (first, same, other)]
+        frames = [factor * v[None, None] for v in noisy]
+        tracker = Tracker(frames[0][0], [HOME], SIZE)
+        reference, off = tracker.references[0], []
+        for frame in frames[1:]:
+            found = effects(reference, frame)
+            left = found.total[:, 6] / found.total[:, 0]
+            off.append(disagreement(reference.leverage, found.sums[:, 7:], left, found.gain))
+        assert off[0] is None
+        assert off[1] is not None
+        assert 0.02 < float(off[1][0, 0].abs()) < 0.2

@@ -31,6 +31,7 @@ from torch_ecc.core.criteria import Criterion, make_criterion, safe_inverse
 from torch_ecc.core.filters import pad
 from torch_ecc.core.frame import as_gray, as_mask, require_tensor
 from torch_ecc.core.grid import Grid, Place, grid_of, place_of
+from torch_ecc.core.leverage import Leverage, leverage_of
 from torch_ecc.core.noise import DIM_BLURS, INSTRUMENT_BLUR, NOISE_SHARE, Noise, blurred, template_noise
 from torch_ecc.core.normal import Moments, Normal, normal_equations
 from torch_ecc.core.pose import rotation
@@ -116,6 +117,13 @@ class Reference(_Groups):
         return strains_of(self.parts, self.normal) if torch.compiler.is_compiling() else self._kept_strains
 
     @property
+    def leverage(self) -> Leverage:
+        """That of their blocks: made once, if it is needed."""
+        if torch.compiler.is_compiling():
+            return leverage_of(self.blocks, self.parts, self.normal)
+        return self._kept_leverage
+
+    @property
     def patch(self) -> Tensor:
         """Pixels (B,) that their texture is alike over: made once, if it is needed."""
         return patch_of(self) if torch.compiler.is_compiling() else self._kept_patch
@@ -139,6 +147,11 @@ class Reference(_Groups):
     @lasting
     def _kept_strains(self) -> Strains:
         return strains_of(self.parts, self.normal)
+
+    @cached_property
+    @lasting
+    def _kept_leverage(self) -> Leverage:
+        return leverage_of(self.blocks, self.parts, self.normal)
 
     @cached_property
     @lasting

@@ -14,7 +14,7 @@ from torch_ecc.core.robust import Memory
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.track.budget import BURST
-from torch_ecc.track.pinned import pinned
+from torch_ecc.track.pinned import held
 
 PREDICTIONS = ("hold", "velocity")
 MEMORY = 0.05  # weight of the newest frame in the usual score
@@ -67,7 +67,7 @@ class Remembering:
             state["trust"].fill_(1)
         else:
             state["trust"].copy_(torch.where(Status.good(estimate.status)[:, None], found.trust, 1.0))
-        return pinned(estimate, reference, state)
+        return held(estimate, found, reference, state)
 
 
 def advanced(state: State, estimate: Estimate) -> Estimate:

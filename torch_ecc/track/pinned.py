@@ -1,4 +1,4 @@
-"""Noise that is the same in all frames, a camera's fixed pattern: it holds a template where that was cut.
+"""What is the same in all frames holds a template where that was cut: a camera's fixed pattern, and its marks.
 
 The template's gradients hold the pattern of the frame that they are from. Less than a pixel away it is still there, and
 adds to what they find the pull of errors in variables,
@@ -8,6 +8,9 @@ adds to what they find the pull of errors in variables,
 of noise of variance v, of which the share c stays, at a displacement d; S and N as in ``covariance``. The share is what
 is missing of the residuals next to where the template was cut. What is taken for noise may be fine texture, of which as
 much is missing everywhere.
+
+A mark of more contrast than the rest stays, and so does the pose, long before too much is left of any block. Then the
+rest says something else: see ``core.leverage``.
 """
 
 from __future__ import annotations
@@ -18,39 +21,61 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.leverage import disagreement
+from torch_ecc.core.normal import LEAST
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import is_cpu
+from torch_ecc.core.solution import Solution
+from torch_ecc.track.watch import HEEDED
 
 NEAR, FAR = 0.5, 3.0  # px: so near the pattern is the same, and so far it is another
-LEAST = 0.35  # of the noise may be missing anyhow: between pixels of a frame, and where its estimate is coarse
+LEAST_SHARE = 0.35  # of the noise may be missing anyhow: between pixels of a frame, and where its estimate is coarse
 REACH = 2.4  # px^2
 TEXTURE = -1.0  # as a share: it is not noise
+UNSEEN = 2.0  # px: farther off marks are seen, see ``watch``
+AS_MUCH = 2.0  # times what the rest says: bounded, a mark still has its say
+
+
+def held(estimate: Estimate, found: Solution, reference: Reference, state: Mapping[str, Tensor]) -> Estimate:
+    """The ``estimate`` (R, ...) of what was ``found`` in a frame, whose covariance tells of both."""
+    estimate, moved = pinned(estimate, reference, state), estimate.displacement.detach()
+    if is_cpu(moved.device) and all(x * x + y * y > UNSEEN**2 for x, y, _ in moved.tolist()):
+        return estimate
+    left = found.total[:, 6] / found.total[:, 0].clamp(min=LEAST)
+    off = disagreement(reference.leverage, found.sums[:, 7:], left, found.gain)
+    if off is None:
+        return estimate
+    near = (moved[:, :2].square().sum(1) <= UNSEEN**2) & (state["heed"] != HEEDED) & Status.good(estimate.status)
+    return uncertain(estimate, torch.where(near[:, None], AS_MUCH * off, 0.0))
 
 
 def pinned(estimate: Estimate, reference: Reference, state: Mapping[str, Tensor]) -> Estimate:
-    """The ``estimate`` (R, ...) of a frame, whose covariance tells of that pull; the shares (R,) are kept in the
-    ``state`` of a tracker."""
+    """The ``estimate`` (R, ...) of a frame, whose covariance tells of the pattern's pull; the shares (R,) are kept in
+    the ``state`` of a tracker."""
     noise, known, rms = reference.noise, state["fixed"], estimate.residual_rms.detach()
     on_cpu = is_cpu(rms.device)
     if on_cpu and nothing_missing(*(value.tolist() for value in (known, rms, noise.power, noise.frames))):
         return estimate
-    pose, moved = estimate.pose.detach(), (estimate.pose - state["start"]).detach()
-    distance2, missing = moved[:, :2].square().sum(1), 1 - rms.square() / (noise.power * (1 + noise.frames))
-    seen, stays = Status.good(estimate.status), missing > LEAST
+    moved, missing = estimate.displacement.detach(), 1 - rms.square() / (noise.power * (1 + noise.frames))
+    distance2, seen, stays = moved[:, :2].square().sum(1), Status.good(estimate.status), missing > LEAST_SHARE
     share = torch.where(seen & (distance2 <= NEAR**2) & (known >= 0), torch.where(stays, missing, 0.0), known)
     known.copy_(torch.where(seen & (distance2 > FAR**2) & stays, TEXTURE, share))
     if on_cpu and not bool((known > 0).any()):
         return estimate
-    axes, pull = turn(pose[:, 2]), known.clamp(min=0) * noise.of_frame * (-distance2 / REACH).exp()
-    bread = reference.normal.bread, reference.normal.bread_bias
-    turned = (axes.mT @ moved[:, :, None]) * pull[:, None, None]
-    off = axes @ (torch.linalg.inv_ex(bread[0])[0] @ (bread[1] @ turned))
-    more = (off @ off.mT).nan_to_num(0.0, 0.0, 0.0)
-    return estimate._replace(covariance=estimate.covariance + more)
+    pull = known.clamp(min=0) * noise.of_frame * (-distance2 / REACH).exp()
+    turned = turn(estimate.pose.detach()[:, 2]).mT @ moved[:, :, None]
+    solved = torch.linalg.inv_ex(reference.normal.bread)[0] @ (reference.normal.bread_bias @ turned)
+    return uncertain(estimate, solved[:, :, 0] * pull[:, None])
+
+
+def uncertain(estimate: Estimate, off: Tensor) -> Estimate:
+    """The ``estimate`` (R, ...) whose poses may be ``off`` (R, 3), in the template's axes, too."""
+    there = turn(estimate.pose.detach()[:, 2]) @ off[:, :, None]
+    return estimate._replace(covariance=estimate.covariance + (there @ there.mT).nan_to_num(0.0, 0.0, 0.0))
 
 
 def nothing_missing(share: list[float], rms: list[float], power: list[float], frames: list[float]) -> bool:
     """Whether the host sees at once that templates have all the residuals that noise leaves, or it is no noise."""
     each = zip(share, rms, power, frames, strict=True)
-    return all(s < 0 or (s == 0 and r * r >= (1 - LEAST) * p * (1 + n)) for s, r, p, n in each)
+    return all(s < 0 or (s == 0 and r * r >= (1 - LEAST_SHARE) * p * (1 + n)) for s, r, p, n in each)

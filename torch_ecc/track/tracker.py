@@ -35,7 +35,7 @@ from torch_ecc.track.shutter import Shutter
 from torch_ecc.track.textureless import warn_of_textureless
 from torch_ecc.track.watch import Marks, Watch
 
-DERIVED = ("references", "_look", "_marks", "_recovery", "_crowd", "_teacher", "_version")  # follow from the state
+DERIVED = ("references", "_unmarked", "_look", "_marks", "_recovery", "_crowd", "_teacher", "_version")  # of the state
 
 
 class SequenceError(ValueError):
@@ -155,7 +155,7 @@ class Tracker(nn.Module):
         if self.learns:
             for name, value in Lessons.begin(self.template, self.references[0].noise.level, start).items():
                 self.register_buffer(name, value)
-            self._use([told(self.references[0], self._buffers), *self.references[1:]])
+            self._use([told(self._unmarked[0], self._buffers), *self._unmarked[1:]])
         warn_of_textureless(self._recovery.textureless)
 
     @classmethod
@@ -180,7 +180,7 @@ class Tracker(nn.Module):
         tracker.finds_marks = isinstance(frame_mask, str)
         for name, value in Watch.begin(view, tracker.start)._asdict().items():
             tracker.register_buffer(name, value)
-        tracker._use(tracker.references)
+        tracker._use(tracker._unmarked)
         settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
         located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
         tracker.register_buffer("first", kept(filled(view, tracker.frame_mask)))
@@ -211,7 +211,7 @@ class Tracker(nn.Module):
 
     def _use(self, references: list[Reference]) -> None:
         """Goes on with ``references``, in what the camera shows."""
-        first, marks = seen_through(references[0], self.frame_mask), self.finds_marks
+        self._unmarked, first, marks = references, seen_through(references[0], self.frame_mask), self.finds_marks
         self._marks = Marks.of(first, self.settings, self._buffers, marks) if self.watches else None
         self.references = [self._marks.reference if self._marks else first, *references[1:]]
         budget = Budget(self.credit, self.turn, math.prod(self.frame_shape), self.template.numel())
@@ -234,7 +234,7 @@ class Tracker(nn.Module):
             with torch.no_grad():
                 new = self._teacher(image, warp, estimate, suspects, state)
                 if len(new) > 0:
-                    self._use(renewed(self.references, new, state, self._prepared))
+                    self._use(renewed(self._unmarked, new, state, self._prepared))
         self.shutter.remember(state, estimate)
         return estimate
 
@@ -255,7 +255,7 @@ class Tracker(nn.Module):
         super()._apply(lambda tensor: tensor.to(device), recurse)  # type: ignore[no-untyped-call]
         self.frame_mask = None if self.frame_mask is None else self.frame_mask.to(device)
         self.dead = None if self.dead is None else self.dead.to(device)
-        self._use([reference.map(lambda tensor: tensor.to(device)) for reference in self.references])
+        self._use([reference.map(lambda tensor: tensor.to(device)) for reference in self._unmarked])
         return self
 
     def __getstate__(self) -> dict[str, Any]:
@@ -285,7 +285,7 @@ class Tracker(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         with_all_ages(state_dict, prefix)
         state = {name: state_dict.get(prefix + name) for name in (*self._buffers, "_extra_state")}
-        references = self.references if all(value is None for value in state.values()) else self._fitting(state)
+        references = self._unmarked if all(value is None for value in state.values()) else self._fitting(state)
         super()._load_from_state_dict(state_dict, prefix, *rest)
         self._use(references)
 
@@ -331,7 +331,7 @@ class Tracker(nn.Module):
         if self._marks is not None:
             estimate, marked = self._marks(images[0], estimate, start, odd)
             if marked:
-                self._use(self.references)
+                self._use(self._unmarked)
         estimate, past = self._within_reach(estimate), Past.of(state)
         if self.search:
             estimate = self._recovery.not_led_away(estimate, start, past)

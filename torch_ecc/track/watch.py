@@ -40,14 +40,15 @@ State = Mapping[str, Tensor]
 class Watch(NamedTuple):
     """What a tracker's state holds of R templates: the ``marks`` (H, W) of the camera, and whether they ``heed`` (R,)
     these: 0, HEEDED or DOUBTED; for how many frames (R,) more was left of them than noise leaves, and ``no_mark`` was
-    found; how ``far`` (R,) px from their places in the first frame one has looked in vain; where they were, ``fitted``
-    (R, 3), when last no more was left than noise; and the first frame's ``level`` (2,), mean and standard deviation in
-    grey levels."""
+    found; how ``far`` (R,) px from their places in the first frame one has looked in vain; by what they may have been
+    off there if there was one, the ``doubt`` (R, 3, 3); where they were, ``fitted`` (R, 3), when last no more was left
+    than noise; and the first frame's ``level`` (2,), mean and standard deviation in grey levels."""
 
     marks: Tensor
     heed: Tensor
     no_mark: Tensor
     far: Tensor
+    doubt: Tensor
     fitted: Tensor
     level: Tensor
 
@@ -58,7 +59,8 @@ class Watch(NamedTuple):
         none = torch.zeros_like(start[:, 0])
         level = torch.stack((frame.mean(), frame.var(correction=0).sqrt()))
         marks = torch.zeros_like(frame[0, 0], dtype=torch.uint8)
-        return Watch(marks, none.to(torch.uint8), none.long(), none, start.clone(), level)
+        doubt = start.new_zeros(len(start), 3, 3)
+        return Watch(marks, none.to(torch.uint8), none.long(), none, doubt, start.clone(), level)
 
     @staticmethod
     def of(state: State) -> Watch:
@@ -139,7 +141,8 @@ class Marks:
         for r in watch.due(odd, moved):
             at = torch.tensor([r], device=start.device)
             found = self.looked(self.still(at, image, start, pure[r]), at, found, estimate.at(at), moved[r])
-        return found
+        near = odd & (watch.heed == 0) & (moved <= ELSEWHERE) & Status.good(estimate.status)  # farther off a mark shows
+        return found._replace(doubt=found.doubt + torch.where(near[:, None, None], watch.doubt, 0.0))
 
     def looked(self, still: Still, at: Tensor, found: Found, estimate: Estimate, moved: Tensor) -> Found:
         """What was ``found``, and what a look tells at the template ``at`` (1,) that has ``moved`` () px, as far as its
@@ -151,8 +154,10 @@ class Marks:
             trial = still.without_marks(pose)
         if trial is None:
             watch.far[at] = watch.far[at].maximum(moved)
-            if good and heed == 0 and not still.pure and bool(moved <= ELSEWHERE):  # farther off a mark shows
-                found.doubt[at] += still.doubt(pose, state["trust"][at])
+            if good and heed == 0 and not still.pure and bool(moved <= ELSEWHERE):
+                watch.doubt[at] = still.doubt(pose, state["trust"][at])
+            elif still.pure:
+                watch.doubt[at] = 0
             return found
         more, other = apart(self.reference.place, estimate, trial.estimate, at)
         taken = self.asked or heed == HEEDED or not good or bool(other)
