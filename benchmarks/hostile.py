@@ -116,10 +116,12 @@ def sensors() -> dict[str, Row]:
         "fixed stripe, faint": partial(cameras.stripe, opacity=0.3),
         "fixed dust, faint": partial(cameras.dust, opacity=0.3),
         **{
-            f"fixed {one.__name__}, JPEG 70": partial(cameras.coded, one=one)
-            for one in (cameras.aperture, cameras.stripe)
+            f"fixed {one.__name__}, {what}": partial(by, one=one)
+            for what, by in (("JPEG 70", cameras.coded), ("a drift of 0.05 px a frame", cameras.drifting))
+            for one in (cameras.aperture, cameras.stripe, cameras.dust)
         },
         "fixed pattern": cameras.fixed_pattern,
+        "fixed pattern, a drift of 0.05 px a frame": partial(cameras.drifting, one=cameras.fixed_pattern),
         "noise in rows": partial(cameras.lined, across=False),
         "noise in columns": partial(cameras.lined, across=True),
         "noise blurred 1 px": cameras.soft,

@@ -58,6 +58,12 @@ def coded(shot: Shot, one: Callable[[Shot], Film], quality: int = 70) -> Film:
     return film._replace(frames=jpeg(film.frames, quality))
 
 
+def drifting(shot: Shot, one: Callable[[Shot], Film], step: float = 0.05) -> Film:
+    """Another film of the same scene, which drifts by ``step`` px a frame."""
+    time = torch.arange(len(shot.path), dtype=shot.path.dtype)
+    return one(shot.moved(shot.path[0] - step * time[:, None] * shot.path.new_tensor((1.0, 0.6, 0.0003))))
+
+
 def fixed_pattern(shot: Shot, sigma: float = 4.0) -> Film:
     """An offset of its own for every pixel, the same in all frames."""
     pattern = sigma * torch.randn(shot.frame, generator=torch.Generator().manual_seed(shot.seed))

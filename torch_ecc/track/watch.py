@@ -26,12 +26,13 @@ from torch_ecc.core.robust import Memory, unusual
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.verdict import LARGEST_SIGMA, expected_score
 from torch_ecc.search.locate import pose_distance
-from torch_ecc.track.still import AROUND, Still, behind
+from torch_ecc.track.still import AROUND, BELIEVED, Still, behind
 
 HEEDED, DOUBTED = 1, 2  # of marks: the template is seen without them; they may be some
 ELSEWHERE = 2.0  # px, of its farthest pixel: what fits there has no mark in it that one does not know of
 FARTHER = 1.5  # times as far one looks again
 AT_ONCE = 4  # templates are looked at in one frame
+SAME = 2.0  # times its sigma
 CLEARLY = 5.0  # times its sigma a pose without marks must be off to be another place
 
 State = Mapping[str, Tensor]
@@ -137,11 +138,13 @@ class Marks:
         moved, fitted = (pose_distance(there, home, radius=radius) for there in (pose, watch.fitted))
         pure = ((fitted > ELSEWHERE) & (watch.heed == 0)).tolist()
         doubt, odd = self.known(image, estimate, start, odd)
-        found = Found(doubt, {}, False)
+        found, good = Found(doubt, {}, False), Status.good(estimate.status)
+        grown = (watch.heed == HEEDED) & (~good | (estimate.coverage < BELIEVED)) & (self.state["since"] == 1)
+        watch.no_mark.masked_fill_(grown, 0)
         for r in watch.due(odd, moved):
             at = torch.tensor([r], device=start.device)
             found = self.looked(self.still(at, image, start, pure[r]), at, found, estimate.at(at), moved[r])
-        near = odd & (watch.heed == 0) & (moved <= ELSEWHERE) & Status.good(estimate.status)  # farther off a mark shows
+        near = odd & (watch.heed == 0) & (moved <= ELSEWHERE) & good  # farther off a mark shows
         return found._replace(doubt=found.doubt + torch.where(near[:, None, None], watch.doubt, 0.0))
 
     def looked(self, still: Still, at: Tensor, found: Found, estimate: Estimate, moved: Tensor) -> Found:
@@ -167,8 +170,19 @@ class Marks:
         else:
             found.doubt[at] = more
         watch.marks.copy_(~trial.shown)
-        watch.heed[at], watch.no_mark[at], watch.far[at] = HEEDED if taken else DOUBTED, 0, 0
+        watch.heed[at] = HEEDED if taken else DOUBTED
+        more_of_it = heed != 0 and not trial.fits  # as behind a coder in every frame
+        if good and more_of_it and (not taken or self.same(estimate, trial.estimate, at)):
+            watch.far[at] = watch.far[at].maximum(moved)
+        else:
+            watch.no_mark[at], watch.far[at] = 0, 0
         return found._replace(new=True)
+
+    def same(self, estimate: Estimate, other: Estimate, at: Tensor) -> bool:
+        """Whether the ``other`` estimate (1, ...) of the template ``at`` (1,) has it where this one does."""
+        lever2, off = self.reference.place.lever2[at], other.pose - estimate.pose
+        own = largest_variance(lever2, other.covariance)
+        return bool((off.square() * lever2).sum(1) <= SAME**2 * own)
 
     def still(self, at: Tensor, image: Tensor, start: Tensor, pure: bool) -> Still:
         """The template ``at`` (1,)."""
