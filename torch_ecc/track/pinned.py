@@ -65,7 +65,7 @@ def pinned(estimate: Estimate, reference: Reference, state: Mapping[str, Tensor]
         return estimate
     pull = known.clamp(min=0) * noise.of_frame * (-distance2 / REACH).exp()
     turned = turn(estimate.pose.detach()[:, 2]).mT @ moved[:, :, None]
-    solved = torch.linalg.inv_ex(reference.normal.bread)[0] @ (reference.normal.bread_bias @ turned)
+    solved = reference.normal.inverse[:, :3, :3] @ (reference.normal.bread_bias @ turned)  # the first is that of S
     return uncertain(estimate, solved[:, :, 0] * pull[:, None])
 
 
