@@ -138,3 +138,10 @@ def test_what_most_of_a_template_recognises_is_believed() -> None:
     run = still.part(1, [Moment(n % 40, "cover" if n > 5 else "clean", 0.2) for n in range(1, 80)])
     assert not bool((run.wrong & run.believed).any())
     assert int((run.status > Status.MAX_ITERATIONS).sum()) <= 25
+
+
+def test_where_it_was_last_it_has_stayed_or_it_is_not_there() -> None:
+    """A corner looks like all others once turned by 90 deg: least squares that slides there from the last place, in
+    which a lost template is tried, has found another one."""
+    run = soak.Soak.of("pads", 21, (0, 150), 61).run()[0][0]
+    assert not bool((run.wrong & run.believed).any())

@@ -43,6 +43,7 @@ SELDOM = 16  # frames between two searches for what has been lost for long
 ALIGNED, NEARBY_ALIGNED = 20_000_000, 1_000_000  # pixels that can be read while a search aligns what it has found
 KNOWN = 0.75 * REACH  # px: look-alikes of a place found near are known if it is not farther from the last one
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
+AT_REST = 8.0  # px at the farthest pixel: what has moved more has not stayed where it was
 COARSE = (8.0, ANGLE_STEP)  # px, rad: as finely as places are told apart before they are refined
 SLID = 16.0  # px beyond the last step: where something else was tracked, if it does not look as usual either
 WHOLE = 0.9  # of a template's weight must be in sight where it has leapt to: many things have parts that look alike
@@ -108,7 +109,8 @@ def from_rest(reference: Reference, image: Tensor, estimate: Estimate, past: Pas
     part = reference.select(index)
     memory = Memory.none(part)._replace(score=past.usual[index])
     found, _ = solve_again(part, view, past.pose[index], settings, past.home[index], memory)
-    good = Status.good(found.status) & ~of_a_part(part, found, image)
+    stayed = pose_distance(found.pose, past.pose[index], radius=part.place.radius) <= AT_REST
+    good = Status.good(found.status) & stayed & ~of_a_part(part, found, image)
     return estimate.put(index[good], found.at(good))
 
 
