@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -150,3 +152,30 @@ def test_a_told_mask_is_the_last_word() -> None:
     tracker = Tracker(frames[0], CENTER, SIZE, frame_mask=SHOWN["stripe"])
     tracker.track_sequence(frames[1:])
     assert not tracker.marks.any()
+
+
+def test_a_coder_brings_no_pose_into_doubt() -> None:
+    """What it leaves stands still, too, next to where a template was cut; but all blocks say the same of the pose."""
+    motion = path(count=8, step=0.2)
+    frames = torch.from_numpy(np.stack([through_jpeg(frame.numpy()) for frame in filmed(motion)]))
+    track = Tracker(frames[0], CENTER, SIZE).track_sequence(frames[1:])
+    error = off(track, motion)
+    assert (track.sigma[:, 0, :2] < 0.1).all()
+    assert (error < 5 * track.sigma[:, 0]).all()
+
+
+@marks
+def test_marks_in_front_of_a_coder_are_told_all_the_same(mark: str) -> None:
+    """Though nothing fits there as noise lets expect."""
+    motion = path(count=20)
+    frames = torch.from_numpy(np.stack([through_jpeg(frame.numpy()) for frame in filmed(motion, SHOWN[mark])]))
+    track = Tracker(frames[0], CENTER, SIZE).track_sequence(frames[1:])
+    error, far = off(track, motion), torch.tensor([0.1, 0.1, 0.1 * torch.pi / 180])
+    assert not ((error > far) & (error > 5 * track.sigma[:, 0]) & (track.status == Status.CONVERGED)).any()
+    assert (track.status == Status.CONVERGED).all()
+    assert error[5:, :2].max() < 0.1
+
+
+def through_jpeg(frame: np.ndarray) -> np.ndarray:
+    """As a coder leaves it."""
+    return cv2.imdecode(cv2.imencode(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, 70))[1], cv2.IMREAD_GRAYSCALE)

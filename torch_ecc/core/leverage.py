@@ -9,7 +9,7 @@ too small to be seen. So the pose is asked for once more with blocks that count 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,6 +19,10 @@ from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.sampling import is_cpu
 
+if TYPE_CHECKING:
+    from torch_ecc.core.solution import Solution
+
+AS_MUCH = 2.0  # times d: bounded, they still have their say
 CERTAIN = 12.0  # of three squares of a standard normal: one in a hundred is as large
 
 
@@ -49,14 +53,14 @@ def leverage_of(blocks: Blocks, parts: Parts, normal: Normal) -> Leverage:
     return Leverage(bounded[:, 0, 0, :, None].to(dtype), step.to(dtype), unit.to(dtype))
 
 
-def disagreement(leverage: Leverage, effect: Tensor, left: Tensor, gain: Tensor) -> Tensor | None:
-    """By what (B, 3) poses, in the template's axes, would be others with bounded leverage, of the ``effect``
-    (B, 3, blocks) of residuals of which so much is ``left`` (B,), a variance, seen with a ``gain`` (B,); 0 where that
-    may be noise. None if it is known that it is for all."""
+def disagreement(leverage: Leverage, found: Solution) -> Tensor | None:
+    """By what (B, 3) the poses that were ``found`` may be off if blocks of high leverage are wrong, in the template's
+    axes and either way; 0 where they say the same but for noise. None if it is known that all do."""
     bounded, step, unit = leverage
-    asked = torch.bmm(effect, bounded)
+    asked = torch.bmm(found.sums[:, 7:10], bounded)
     square = torch.linalg.vector_norm(torch.bmm(unit, asked), dim=(1, 2)).square()
-    if is_cpu(square.device) and all(s <= CERTAIN * v for s, v in zip(square.tolist(), left.tolist(), strict=True)):
+    noise = found.total[:, 6] / found.total[:, 0].clamp(min=LEAST)
+    if is_cpu(square.device) and all(s <= CERTAIN * v for s, v in zip(square.tolist(), noise.tolist(), strict=True)):
         return None
-    off = torch.bmm(step, asked)[:, :, 0].to(gain) / gain[:, None]
-    return torch.where((square > CERTAIN * left)[:, None], off, 0.0)
+    off = AS_MUCH * torch.bmm(step, asked)[:, :, 0].to(noise) / found.gain[:, None]
+    return torch.where((square > CERTAIN * noise)[:, None], off, 0.0)

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.leverage import disagreement
-from torch_ecc.core.normal import LEAST
 from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import is_cpu
@@ -34,7 +33,6 @@ LEAST_SHARE = 0.35  # of the noise may be missing anyhow: between pixels of a fr
 REACH = 2.4  # px^2
 TEXTURE = -1.0  # as a share: it is not noise
 UNSEEN = 2.0  # px: farther off marks are seen, see ``watch``
-AS_MUCH = 2.0  # times what the rest says: bounded, a mark still has its say
 
 
 def held(estimate: Estimate, found: Solution, reference: Reference, state: Mapping[str, Tensor]) -> Estimate:
@@ -42,12 +40,11 @@ def held(estimate: Estimate, found: Solution, reference: Reference, state: Mappi
     estimate, moved = pinned(estimate, reference, state), estimate.displacement.detach()
     if is_cpu(moved.device) and all(x * x + y * y > UNSEEN**2 for x, y, _ in moved.tolist()):
         return estimate
-    left = found.total[:, 6] / found.total[:, 0].clamp(min=LEAST)
-    off = disagreement(reference.leverage, found.sums[:, 7:], left, found.gain)
+    off = disagreement(reference.leverage, found)
     if off is None:
         return estimate
     near = (moved[:, :2].square().sum(1) <= UNSEEN**2) & (state["heed"] != HEEDED) & Status.good(estimate.status)
-    return uncertain(estimate, torch.where(near[:, None], AS_MUCH * off, 0.0))
+    return uncertain(estimate, torch.where(near[:, None], off, 0.0))
 
 
 def pinned(estimate: Estimate, reference: Reference, state: Mapping[str, Tensor]) -> Estimate:

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch_ecc.core.align import solve_again
 from torch_ecc.core.covariance import largest_variance
 from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.leverage import disagreement
 from torch_ecc.core.noise import noise_level
 from torch_ecc.core.normal import LEAST
 from torch_ecc.core.pose import turn
@@ -230,6 +231,13 @@ class Still(NamedTuple):
     pure: bool
     settings: Settings
 
+    def disagreement(self) -> Tensor | None:
+        """By what (1, 3) least squares may be off if the blocks that fix it are wrong, None if all say the same."""
+        memory, settings = Memory.none(self.reference), replace(self.settings, robust=False)
+        _, found = solve_again(self.reference, self.image, self.start, settings, self.home, memory)
+        off = disagreement(self.reference.leverage, found)
+        return off if off is not None and bool((off != 0).any()) else None
+
     def trial(self, shown: Tensor) -> Trial | None:
         """With less that is ``shown``; None if hardly anything is left of it."""
         reference = behind(self.reference, self.home, ~shown, torch.ones_like(self.home[:, 0], dtype=torch.bool))
@@ -293,8 +301,12 @@ class Still(NamedTuple):
     def doubt(self, pose: Tensor, trusted: Tensor) -> Tensor:
         """By what (1, 3, 3) it may be off at a ``pose`` (1, 3) if all that stands still is no part of it: a covariance
         of as much as leaves what is left of the others in blocks that are ``trusted`` (1, blocks), and more than noise;
-        no more than it may have moved unseen."""
+        no more than it may have moved unseen, and none if all blocks say the same of the pose."""
         reference, axes = self.reference, turn(pose[:, 2])
+        off = self._replace(start=pose).disagreement()
+        if off is None:
+            return torch.zeros_like(axes)
+        there = axes @ off[:, :, None]
         seen = look(self, pose, reference, through_coder=False)
         warps = reference.warps(torch.cat((pose, self.home)))
         now, home = (warps - shift(*seen.corner, warps)).split(1)
@@ -303,11 +315,11 @@ class Still(NamedTuple):
         moving = inside(now, pixels, size) & ~frozen & (trusted[:, reference.grid.block] == 1)
         left = picked(seen.left, now, pixels)[moving]
         if len(left) == 0:
-            return torch.zeros_like(axes)
+            return there @ there.mT
         noise = left.quantile(QUIET).mul(TO_MEAN).clamp(max=seen.noise)  # the estimate is an upper one
         more = (left - noise).sum() - BY_CHANCE * noise * (2 * len(left)) ** 0.5
         normal = reweigh(reference, moving).normal
         half = axes @ normal.inverse[:, :3, :3]
         doubt: Tensor = half @ normal.meat @ half.mT * more.clamp(min=0)
         most = largest_variance(reference.place.lever2, doubt)
-        return doubt * (UNSEEN**2 / most.clamp(min=UNSEEN**2)).view(-1, 1, 1)
+        return doubt * (UNSEEN**2 / most.clamp(min=UNSEEN**2)).view(-1, 1, 1) + there @ there.mT
