@@ -25,7 +25,7 @@ from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator
 from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, skipped
 from torch_ecc.track.budget import Budget, income
 from torch_ecc.track.crowd import Crowd
-from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told, with_all_ages
+from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told, with_new_parts
 from torch_ecc.track.light import told_of_light
 from torch_ecc.track.look import Look
 from torch_ecc.track.max_step import MaxStep
@@ -283,7 +283,7 @@ class Tracker(nn.Module):
 
     @lasting
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        with_all_ages(state_dict, prefix)
+        with_new_parts(state_dict, prefix)
         state = {name: state_dict.get(prefix + name) for name in (*self._buffers, "_extra_state")}
         references = self._unmarked if all(value is None for value in state.values()) else self._fitting(state)
         super()._load_from_state_dict(state_dict, prefix, *rest)
