@@ -147,9 +147,13 @@ def test_what_has_slid_away_is_elsewhere():
     tracker = Tracker(camera(seen(), 0), [MIDDLE], SIZE)
     past, found = Past.of(dict(tracker.named_buffers())), tracker(camera(seen(), 1))
     home = past.home
-    slid, radius = found._replace(pose=found.pose + torch.tensor([40.0, 0.0, 0.0])), torch.tensor([70.0])
-    for estimate, suspects, reason in ((slid, [True], 6), (slid, [False], 0), (found, [True], 0)):
-        told = disbelieved(estimate, suspects, home, past, radius)
+    slid = found._replace(pose=found.pose + torch.tensor([40.0, 0.0, 0.0]))
+    weak = found._replace(score=0.8 * found.score)
+    part = weak._replace(pose=found.pose - torch.tensor([MIDDLE[0], 0.0, 0.0]))
+    looks = (slid, [True], 6), (slid, [False], 0), (found, [True], 0), (weak, [True], 0), (part, [True], 6)
+    for estimate, suspects, reason in looks:
+        start = part.pose if estimate is part else home
+        told = disbelieved(estimate, suspects, start, past, tracker.references[0], camera(seen(), 1))
         assert (told.reason, told.status) == (reason, Status.LOST if reason else Status.CONVERGED)
 
 

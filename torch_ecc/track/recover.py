@@ -34,6 +34,7 @@ from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.textureless import least_contrast, textureless
 from torch_ecc.track.together import TOGETHER, gone_together
 
+RECOGNISED = 0.9  # of its usual score: a part that has less may be of something else
 FAMILIAR = 0.8  # of its usual score: what has less where it was tracked to is searched for in the whole frame
 AT_ONCE = 4  # templates searched for in the whole of one frame; the others in turn
 KEPT = 2**25  # complex numbers prepared for searches of the whole frame, 256 MB
@@ -91,11 +92,18 @@ def strayed(estimate: Estimate, start: Tensor, past: Past, radius: Tensor, most:
     return step > most + last
 
 
-def disbelieved(estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, radius: Tensor) -> Estimate:
-    """The ``estimate`` in which those that are still suspect, and have slid away from where they were expected, are
-    lost."""
-    slid = (estimate.origin == Origin.TRACKED) & strayed(estimate, start, past, radius, SLID)
-    lost = torch.tensor(suspects, device=start.device) & slid & Status.good(estimate.status)
+def disbelieved(
+    estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, reference: Reference, frame: Tensor
+) -> Estimate:
+    """The ``estimate`` in a ``frame`` (..., H, W) in which those that are still suspect are lost if they have slid away
+    from where they were expected, or hardly look like themselves and are not in sight as a whole."""
+    index = (torch.tensor(suspects, device=start.device) & Status.good(estimate.status)).nonzero()[:, 0]
+    if len(index) == 0:
+        return estimate
+    slid = (estimate.origin == Origin.TRACKED) & strayed(estimate, start, past, reference.place.radius, SLID)
+    part = share_in_sight(reference.select(index), estimate.pose.detach()[index], frame) < WHOLE
+    part &= (estimate.score < RECOGNISED * past.usual)[index]
+    lost = torch.zeros_like(slid).index_put((index,), slid[index] | part)
     return disproved(estimate, lost, Reason.ELSEWHERE)
 
 

@@ -342,7 +342,7 @@ class Tracker(nn.Module):
             if self.search:
                 estimate = self._within_reach(self._recovery(images, estimate, start, past))
                 suspects = suspect(estimate, state["score"])
-                estimate = disbelieved(estimate, suspects, start, past, reference.place.radius)
+                estimate = disbelieved(estimate, suspects, start, past, reference, images[0])
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
         if not doubtful and apart is estimate:
             return self._learned(image, advanced(state, estimate), [False] * len(start))
