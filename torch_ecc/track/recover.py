@@ -21,7 +21,7 @@ from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.reference import Reference
-from torch_ecc.core.robust import Memory
+from torch_ecc.core.robust import RECOGNISED, Memory
 from torch_ecc.core.sampling import inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
@@ -34,7 +34,6 @@ from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.textureless import least_contrast, textureless
 from torch_ecc.track.together import TOGETHER, gone_together
 
-RECOGNISED = 0.9  # of its usual score: a part that has less may be of something else
 FAMILIAR = 0.8  # of its usual score: what has less where it was tracked to is searched for in the whole frame
 AT_ONCE = 4  # templates searched for in the whole of one frame; the others in turn
 KEPT = 2**25  # complex numbers prepared for searches of the whole frame, 256 MB

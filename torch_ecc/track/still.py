@@ -251,7 +251,7 @@ class Still(NamedTuple):
         left = float(solution.total[:, 6] / solution.total[:, 0].clamp(min=LEAST))
         return Trial(found, odd, left, reference, shown)
 
-    def apart(self, pose: Tensor, other: Tensor) -> float:
+    def distance(self, pose: Tensor, other: Tensor) -> float:
         """Px, of its farthest pixel at poses (1, 3)."""
         return float(pose_distance(pose, other, radius=self.reference.place.radius))
 
@@ -259,8 +259,8 @@ class Still(NamedTuple):
         """Whether a ``trial`` without marks is what it is, and not as well with them, at that place: because it fits,
         or, as behind a coder nothing does, because the marks told from it lead back to it, as from the ``last`` one,
         and with them far more is left."""
-        settled = last is not None and self.apart(trial.estimate.pose, last.estimate.pose) < SETTLED
-        if not trial.fits and not (settled and trial.known and self.apart(trial.estimate.pose, self.home) > AWAY):
+        settled = last is not None and self.distance(trial.estimate.pose, last.estimate.pose) < SETTLED
+        if not trial.fits and not (settled and trial.known and self.distance(trial.estimate.pose, self.home) > AWAY):
             return False
         there = self._replace(start=trial.estimate.pose)
         if trial.fits:

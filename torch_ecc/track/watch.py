@@ -32,8 +32,7 @@ HEEDED, DOUBTED = 1, 2  # of marks: the template is seen without them; they may 
 ELSEWHERE = 2.0  # px, of its farthest pixel: what fits there has no mark in it that one does not know of
 FARTHER = 1.5  # times as far one looks again
 AT_ONCE = 4  # templates are looked at in one frame
-SAME = 2.0  # times its sigma
-CLEARLY = 5.0  # times its sigma a pose without marks must be off to be another place
+SAME, CLEARLY = 2.0, 5.0  # times its sigma a pose without marks is off where it is the same place, or another one
 
 State = Mapping[str, Tensor]
 
@@ -162,7 +161,7 @@ class Marks:
             elif still.pure:
                 watch.doubt[at] = 0
             return found
-        more, other = apart(self.reference.place, estimate, trial.estimate, at)
+        more, same, other = apart(self.reference.place, estimate, trial.estimate, at)
         taken = self.asked or heed == HEEDED or not good or bool(other)
         if taken:
             found.instead[int(at)] = trial.estimate
@@ -172,17 +171,11 @@ class Marks:
         watch.marks.copy_(~trial.shown)
         watch.heed[at] = HEEDED if taken else DOUBTED
         more_of_it = heed != 0 and not trial.fits  # as behind a coder in every frame
-        if good and more_of_it and (not taken or self.same(estimate, trial.estimate, at)):
+        if good and more_of_it and (not taken or bool(same)):
             watch.far[at] = watch.far[at].maximum(moved)
         else:
             watch.no_mark[at], watch.far[at] = 0, 0
         return found._replace(new=True)
-
-    def same(self, estimate: Estimate, other: Estimate, at: Tensor) -> bool:
-        """Whether the ``other`` estimate (1, ...) of the template ``at`` (1,) has it where this one does."""
-        lever2, off = self.reference.place.lever2[at], other.pose - estimate.pose
-        own = largest_variance(lever2, other.covariance)
-        return bool((off.square() * lever2).sum(1) <= SAME**2 * own)
 
     def still(self, at: Tensor, image: Tensor, start: Tensor, pure: bool) -> Still:
         """The template ``at`` (1,)."""
@@ -202,16 +195,16 @@ class Marks:
         settings, home, memory = replace(self.settings, robust=False), self.state["start"], Memory.none(part)
         without, solution = solve_again(part, image, start[index], settings, home[index], memory)
         left = unusual(part, solution, self.settings, memory.score)
-        more, other = apart(self.reference.place, estimate.at(index), without, index)
+        more, _, other = apart(self.reference.place, estimate.at(index), without, index)
         odd_still = other | ~Status.good(without.status) | ~Status.good(estimate.status[index])
         odd_still |= torch.zeros_like(odd_still) if left is None else left
         return doubt.index_copy(0, index, more), odd.index_copy(0, index, odd_still)
 
 
-def apart(place: Place, found: Estimate, without: Estimate, index: Tensor) -> tuple[Tensor, Tensor]:
+def apart(place: Place, found: Estimate, without: Estimate, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """By what covariance (n, 3, 3) the poses ``found`` of templates at ``index`` (n,) are in doubt if those ``without``
-    marks may be right, which may be off by their own; and which (n,) of these are other places."""
+    marks may be right, which may be off by their own; and which (n,) of these are the same, and which other places."""
     off, lever2 = without.pose - found.pose, place.lever2[index]
     square, own = (off.square() * lever2).sum(1), largest_variance(lever2, without.covariance)
     more = (1 - own / square.clamp(min=LEAST)).clamp(min=0)[:, None, None] * off[:, :, None] * off[:, None]
-    return more, square > (CLEARLY**2 * own).clamp(min=LARGEST_SIGMA**2)
+    return more, square <= SAME**2 * own, square > (CLEARLY**2 * own).clamp(min=LARGEST_SIGMA**2)
