@@ -122,6 +122,8 @@ def sensors() -> dict[str, Row]:
         },
         "fixed pattern": cameras.fixed_pattern,
         "fixed pattern, a drift of 0.05 px a frame": partial(cameras.drifting, one=cameras.fixed_pattern),
+        "fixed columns": cameras.fixed_columns,
+        "fixed columns, a drift of 0.05 px a frame": partial(cameras.drifting, one=cameras.fixed_columns),
         "noise in rows": partial(cameras.lined, across=False),
         "noise in columns": partial(cameras.lined, across=True),
         "noise blurred 1 px": cameras.soft,

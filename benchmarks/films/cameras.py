@@ -71,6 +71,12 @@ def fixed_pattern(shot: Shot, sigma: float = 4.0) -> Film:
     return shot.sensed(frames, None, NOISE**2 + sigma**2 + rounding(8))
 
 
+def fixed_columns(shot: Shot, sigma: float = 3.0) -> Film:
+    """An offset of its own for every column, the same in all frames."""
+    offsets = sigma * torch.randn(1, shot.frame[1], generator=torch.Generator().manual_seed(shot.seed))
+    return shot.sensed(sense(shot.clean + offsets, shot.seed))
+
+
 def lined(shot: Shot, across: bool) -> Film:
     """Beside white noise an offset of 2 grey levels for every row, or column where ``across``, drawn in every frame."""
     h, w = shot.frame
