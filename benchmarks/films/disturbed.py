@@ -70,11 +70,13 @@ def rolling(shot: Shot) -> Film:
 
 
 def interlaced(shot: Shot) -> Film:
-    """Odd rows are exposed half a frame after the even ones; the pose is that in between."""
+    """Odd rows are exposed half a frame after the even ones; the pose is the mean of both, which is not that of the time
+    in between: what speeds up by 0.5 px a frame is 0.016 px off it."""
     time = frames(len(shot.path))
-    image = shot.moved(eq11(time - 0.25)).clean
-    image[..., 1::2, :] = shot.moved(eq11(time + 0.25)).clean[..., 1::2, :]
-    return from_rest(shot, image, shot.path)
+    even, odd = eq11(time - 0.25), eq11(time + 0.25)
+    image = shot.moved(even).clean
+    image[..., 1::2, :] = shot.moved(odd).clean[..., 1::2, :]
+    return from_rest(shot, image, (even + odd) / 2)
 
 
 def compressed(shot: Shot, quality: int) -> Film:
