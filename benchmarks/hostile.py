@@ -87,6 +87,7 @@ def pictures() -> dict[str, Row]:
         "flicker": disturbed.flicker,
         **{f"blur {s} px": partial(disturbed.blurred, sigma=float(s)) for s in (1, 2, 4)},
         "open shutter": disturbed.smeared,
+        "noise taken out over time": partial(disturbed.averaged, share=0.3),
         "gamma 0.6": partial(disturbed.gamma, power=0.6),
         "scale +1 %": partial(disturbed.scaled_up, percent=1.0),
         "shear 1 %": partial(disturbed.sheared, percent=1.0),

@@ -35,6 +35,14 @@ def smeared(shot: Shot) -> Film:
     return lasting(shot, shot.taken(exposure=1.0))
 
 
+def averaged(shot: Shot, share: float) -> Film:
+    """A camera that takes out noise over time: a ``share`` of every picture is the one before, as it was shown."""
+    shown = [shot.clean[0]]
+    for image in shot.clean[1:]:
+        shown.append(torch.lerp(image, shown[-1], share))
+    return shot.film(torch.stack(shown))
+
+
 def gamma(shot: Shot, power: float) -> Film:
     """Grey levels 255 (g / 255)^power for a while."""
     return lasting(shot, 255 * (shot.clean.clamp(0, 255) / 255) ** power)
