@@ -95,14 +95,15 @@ def disbelieved(
     estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, reference: Reference, frame: Tensor
 ) -> Estimate:
     """The ``estimate`` in a ``frame`` (..., H, W) in which those that are still suspect are lost if they have slid away
-    from where they were expected, or hardly look like themselves and are not in sight as a whole."""
+    from where they were expected, or hardly look like themselves and are not in sight as a whole or were lost before."""
     index = (torch.tensor(suspects, device=start.device) & Status.good(estimate.status)).nonzero()[:, 0]
     if len(index) == 0:
         return estimate
     slid = (estimate.origin == Origin.TRACKED) & strayed(estimate, start, past, reference.place.radius, SLID)
     part = share_in_sight(reference.select(index), estimate.pose.detach()[index], frame) < WHOLE
     part &= (estimate.score < RECOGNISED * past.usual)[index]
-    lost = torch.zeros_like(slid).index_put((index,), slid[index] | part)
+    strange = (past.since > 1) & (estimate.score < FAMILIAR * past.usual)
+    lost = torch.zeros_like(slid).index_put((index,), (slid | strange)[index] | part)
     return disproved(estimate, lost, Reason.ELSEWHERE)
 
 
@@ -224,12 +225,12 @@ class Recovery:
         return bool((square - mean * mean).amax() <= self.flattest)
 
     def due(self, estimate: Estimate, past: Past) -> list[int]:
-        """Which of the suspect templates to search for in this frame: less often those that have a place or too little
-        texture for one, and never those that no search can find."""
-        due = []
-        codes, suspects = estimate.status.tolist(), suspect(estimate, past.usual)
-        for r, (n, code) in enumerate(zip(past.suspect_frames.tolist(), codes, strict=True)):
-            rarely = code <= Status.MAX_ITERATIONS or self.textureless[r]
+        """Which of the suspect templates to search for in this frame: less often those that have had a place since the
+        last frame or too little texture for one, and never those that no search can find."""
+        due, suspects = [], suspect(estimate, past.usual)
+        placed = (Status.good(estimate.status) & (past.since == 1)).tolist()
+        for r, n in enumerate(past.suspect_frames.tolist()):
+            rarely = placed[r] or self.textureless[r]
             pause = n & (n - 1) if rarely else (n + r) % min(1 << min(n // PATIENCE, 8), SELDOM)
             if suspects[r] and pause == 0 and not self.hopeless[r]:
                 due.append(r)
