@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
@@ -64,10 +65,16 @@ class Finished(NamedTuple):
         if reasons := [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]:
             rows, doubted = int(self.reasons.sum()), int(self.reasons[1:].sum())
             said.append(f"{doubted} of {rows} rows are not to be trusted: {', '.join(reasons)}")
-        said += [*told(self.folder), *self.latency.words()]
+        said += [*told(self.folder), *self._clock(), *self.latency.words()]
         whole = sorted(path.name for path in self.folder.iterdir() if path.suffix != ".part") if self.frames else []
         end, names = "Stopped after" if self.interrupted else "Tracked", ", ".join(whole) or "nothing"
         return [*said, f"{end} {self.frames} frames. In {self.folder}/: {names}"]
+
+    def _clock(self) -> list[str]:
+        """What is said of times that are none."""
+        path = self.folder / "summary.json"
+        back = json.loads(path.read_text(encoding="utf-8"))["times_that_do_not_go_on"] if path.is_file() else 0
+        return [f"The time of {back} frames is not later than that of the frame before: --fps tells it"] if back else []
 
     def _losses(self) -> list[str]:
         """What is said of templates that were lost: a line of each, or one of all if they are many."""

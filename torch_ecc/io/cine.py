@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_ecc.io.frames import Medium, Raw
+from torch_ecc.io.frames import Medium, Raw, nominal_rate
 from torch_ecc.io.video import open_video
 
 # Mark, size, compression, version, first and count of the movie, first and count of this file, offsets of three parts.
@@ -30,8 +30,7 @@ def open_cine(path: Path) -> Medium:
         for raw in medium.read(numbers):
             yield raw._replace(time_s=float(times[raw.number]) if raw.number < len(times) else None)
 
-    span = float(times[-1] - times[0]) if len(times) > 1 else 0.0
-    return medium._replace(read=read, length=len(times), fps=(len(times) - 1) / span if span > 0 else medium.fps)
+    return medium._replace(read=read, length=len(times), fps=nominal_rate(times) or medium.fps)
 
 
 def read_times(path: Path) -> NDArray[np.float64] | None:

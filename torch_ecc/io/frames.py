@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, NamedTuple, TypeAlias, overload
@@ -233,6 +233,13 @@ def brief(error: BaseException) -> str:
     """The error of a library in one short line, by its name if it has no words."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[0] if len(lines[0]) <= _LONGEST else f"{lines[0][:_LONGEST]} ..."
+
+
+def nominal_rate(times: Iterable[float]) -> float | None:
+    """Frames per second of most of them, at ``times`` in s: gaps, and a time that is wrong, do not count."""
+    steps = np.diff(np.asarray(list(times)))
+    step = float(np.median(steps)) if len(steps) else 0.0
+    return 1 / step if step > 0 else None
 
 
 def check_dtype(dtype: np.dtype[Any], where: str) -> None:
