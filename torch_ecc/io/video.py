@@ -23,6 +23,7 @@ VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
 _SLACK_FRAMES, _SLACK = 3, 0.02
 _STRICT = {"err_detect": "explode"}  # a frame that is damaged is told, and not made up from its neighbours
 _FROM_ZERO = ("matroska,webm", "nut", "asf")  # that declare when they end, and not how long they last
+_WIDENED = ("gray16le", "gray16be")
 _IMAGES = ("tiff_pipe", "webp_pipe")
 _COVER = 1024  # in the disposition of a stream: the picture on the sleeve of a sound
 _PACKED = {"yuyv422": 0, "yvyu422": 0, "uyvy422": 1}  # where the first luma byte stands among chroma bytes
@@ -36,10 +37,12 @@ _Decoded: TypeAlias = "av.VideoFrame | Jpeg | str"
 
 
 class _Way(NamedTuple):
-    """How a file is decoded: FFmpeg's ``options``, and the size of frames of motion JPEG that are ``plain``."""
+    """How a file is decoded: FFmpeg's ``options``, the size of frames of motion JPEG that are ``plain``, and the bits
+    by which FFmpeg has ``widened`` raw levels."""
 
     options: dict[str, str]
     plain: tuple[int, int] | None
+    widened: int
 
 
 def open_video(path: Path) -> Medium:
@@ -48,9 +51,11 @@ def open_video(path: Path) -> Medium:
         check_size(f"open_frames: {path}", stream.width, stream.height)
         fps, length = _rate(container, stream), _declared(container, stream)
         ratio, others = stream.sample_aspect_ratio or 1, len(container.streams.video) - 1
+        bits = stream.codec_context.bits_per_coded_sample if stream.codec_context.name == "rawvideo" else 0
+        widened = 16 - bits if stream.codec_context.pix_fmt in _WIDENED and 8 < bits < 16 else 0
         first = next((frame for _, frame in _decoded(container, stream)), "")
     # Some writers never close an image as their standard wants it: a decoder that is strict would refuse every frame.
-    way = _Way({} if isinstance(first, str) else _STRICT, _plain_size(path))
+    way = _Way({} if isinstance(first, str) else _STRICT, _plain_size(path), widened)
     uneven = f"{path.name}: its pixels are not square, they are {float(ratio):.4g} times as wide as high"
     beside = f"{path.name}: of its {others + 1} videos the one of {stream.width} x {stream.height} px is read"
     notes = (uneven,) * (ratio != 1) + (beside,) * (others > 0)
@@ -111,7 +116,7 @@ def _read(path: Path, way: _Way, numbers: range) -> Iterator[Raw]:
                 return
             last = time_s if time_s is not None and fps else (count / fps if fps else 0.0)
             if count in numbers:
-                yield _raw(count, frame, last if fps else None)
+                yield _raw(count, frame, last if fps else None, way.widened)
             count += 1
         # Counted in time and with some slack: what containers declare is exact for some and an estimate for others.
         declared, start = _declared(container, stream), float((stream.start_time or 0) * (stream.time_base or 0))
@@ -157,7 +162,7 @@ def _decoded(
     yield from damaged
 
 
-def _raw(number: int, frame: _Decoded, time_s: float | None) -> Raw:
+def _raw(number: int, frame: _Decoded, time_s: float | None, widened: int) -> Raw:
     if isinstance(frame, str):
         return Raw(number, frame, time_s)
     if isinstance(frame, Jpeg):
@@ -166,7 +171,7 @@ def _raw(number: int, frame: _Decoded, time_s: float | None) -> Raw:
     if gray is None:
         return Raw(number, _upright(_rgb(frame), frame), time_s)
     colours = (lambda: _upright(_shown(frame), frame)) if len(frame.format.components) > 1 else None
-    return Raw(number, _upright(gray, frame), time_s, colours=colours)
+    return Raw(number, _upright(gray >> widened if widened else gray, frame), time_s, colours=colours)
 
 
 def _upright(pixels: Pixels, frame: av.VideoFrame) -> Pixels:
