@@ -164,6 +164,17 @@ def test_times_that_do_not_go_on_are_told(tmp_path):
     assert [row.time_s for row in open_frames(path)] == pytest.approx([0, 0.04, 0.04, 0.12, 0.06, 0.2])
 
 
+def test_the_first_file_that_is_damaged_is_named(tmp_path):
+    for number, frame in enumerate(NARROW):
+        Image.fromarray(frame).save(tmp_path / f"f{number}.png")
+    (tmp_path / "f2.png").write_bytes(b"")
+    (tmp_path / "f4.png").write_bytes(b"")
+    job = TrackJob(input=str(tmp_path), centers=((35.0, 24.0),), size=(31, 31), out=str(tmp_path / "r"), overlay=False)
+    said = Session(job).run().words()
+    example = "frame 2 (f2.png cannot be read (it is empty))"
+    assert f"2 of 6 frames are damaged, as {example}: track.csv says which and why" in said
+
+
 def test_the_rate_of_one_channel_is_its_own(tmp_path):
     planes = {"DeltaT": [0.1 * k + 0.01 * c for k in range(6) for c in range(2)]}
     both = np.stack([WIDE, WIDE], 1)

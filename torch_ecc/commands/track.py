@@ -43,12 +43,14 @@ NOT_OF_THE_RESULT = ("out", "force", "resume", "send")
 
 
 class Finished(NamedTuple):
-    """What became of a run: ``frames`` done, of which so many ``damaged``, how many each template was lost in of the
-    others and what speaks against its last pose (R,), how many rows each reason stands in, in the order of Reason, the
-    folder, whether it was stopped from the keyboard or by a signal, and how late poses of a camera's frames were."""
+    """What became of a run: ``frames`` done, of which so many ``damaged``, the first as ``damage`` says ("" if it came
+    before the run went on), how many each template was lost in of the others and what speaks against its last pose
+    (R,), how many rows each reason stands in, in the order of Reason, the folder, whether it was stopped from the
+    keyboard or by a signal, and how late poses of a camera's frames were."""
 
     frames: int
     damaged: int
+    damage: str
     lost: NDArray[np.int64]
     last_reason: NDArray[np.int8]
     reasons: NDArray[np.int64]
@@ -60,7 +62,8 @@ class Finished(NamedTuple):
         """The same in sentences."""
         said = self._losses()
         if self.damaged:
-            said.append(f"{self.damaged} of {self.frames} frames are damaged: track.csv says which and why")
+            example = f", as {self.damage}" if self.damage else ""
+            said.append(f"{self.damaged} of {self.frames} frames are damaged{example}: track.csv says which and why")
         counts = sorted(zip(self.reasons.tolist(), Reason, strict=True), key=lambda each: -each[0])
         if reasons := [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]:
             rows, doubted = int(self.reasons.sum()), int(self.reasons[1:].sum())
