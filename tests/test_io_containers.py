@@ -10,9 +10,11 @@ import av
 import numpy as np
 import pytest
 import tifffile
+from click.testing import CliRunner
 from PIL import Image
 from test_io_kinds import NARROW, WIDE, picture
 
+from torch_ecc.cli import app
 from torch_ecc.commands.jobs import TrackJob
 from torch_ecc.commands.track import Session
 from torch_ecc.io import open_frames
@@ -97,6 +99,21 @@ def test_results_lie_in_a_folder_of_any_name(tmp_path, monkeypatch):
     np.save("v.npy", NARROW)
     Session(TrackJob(input="v.npy", centers=((35.0, 24.0),), size=(31, 31), out="run:1")).run()
     assert len(list(open_frames("run:1/overlay.mp4"))) == 6
+
+
+@pytest.mark.parametrize("name", ["a$_{$b.mkv", "a\nb.mkv", "\x1b[31mred.mkv", "[bold]a.mkv"])
+def test_a_name_is_no_code(tmp_path, name):
+    """Neither of mathematics in a picture nor of colours on a screen."""
+    film(tmp_path / name, "ffv1", "gray")
+    out = tmp_path / "r[bold]"
+    command = ["track", str(tmp_path / name), "--center", "35", "24", "--size", "31", "--out", str(out)]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert (out / "track.png").is_file()
+    assert f"In {out}/: overlay.mp4, " in done.output
+    shown = {"a\nb.mkv": "a\\nb.mkv", "\x1b[31mred.mkv": "\\x1b[31mred.mkv"}.get(name, name)
+    assert f"{shown} " in done.output
+    assert open_frames(tmp_path / name).name == shown
 
 
 def test_pages_under_the_name_of_a_film_are_refused(tmp_path):

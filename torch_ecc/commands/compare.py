@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_ecc.commands.jobs import CompareJob
 from torch_ecc.core.pose import rotation
 from torch_ecc.io.comparison import TrackTable, read_sensors, read_track, write_table
-from torch_ecc.io.output import check_folder, part, publish
+from torch_ecc.io.output import check_folder, part, printable, publish
 from torch_ecc.io.summary import write_json
 from torch_ecc.plots import plot_comparison
 from torch_ecc.records.calibration import Calibration
@@ -175,7 +175,7 @@ def write(job: CompareJob, found: Comparison) -> dict[str, Any]:
         "sensors": found.sensors.pose,
         "nearest": found.nearest,
     }
-    title = f"{Path(job.track).name} and {Path(job.sensors).name}"
+    title = printable(f"{Path(job.track).name} and {Path(job.sensors).name}")
     plot_comparison({name: tensor.numpy() for name, tensor in drawn.items()}, folder / "comparison.png", title=title)
     publish(folder, "errors.csv", "comparison.json")
     return figures

@@ -19,6 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_ecc.io.output import printable
+
 Pixels: TypeAlias = NDArray[Any]
 """One frame as it was stored: (H, W) or (H, W, channels), RGB or RGBA order, any real dtype."""
 
@@ -118,7 +120,7 @@ class FrameSource:
     def __init__(self, name: str, medium: Medium, *, fps: float | None = None, numbers: range | None = None) -> None:
         self._medium, self._rate = medium, fps
         self._numbers = _numbers(medium, slice(None)) if numbers is None else numbers
-        self.name, self.notes, self.um_per_px, self.live = name, medium.notes, medium.um_per_px, medium.live
+        self.name, self.notes, self.um_per_px, self.live = printable(name), medium.notes, medium.um_per_px, medium.live
         self.fps, self.length = medium.fps if fps is None else fps, _length(medium, self._numbers)
         # Frames are read up to the first good one, for its shape, and not read again: a camera goes on.
         stream, begun = medium.read(self._numbers), []
