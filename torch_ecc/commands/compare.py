@@ -22,6 +22,7 @@ from torch_ecc.records.motion import Motion, nearest_errors
 from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
 
 UNITS = {"x_nm": 1e3, "y_nm": 1e3, "theta_urad": 1e6}
+COMMON = 0.5  # of two records of one motion; noise may be more than a small motion
 ODD = 1.1  # a ratio between the sizes of two records that no angle between the axes explains
 WORDS = {
     "offset_s": ("offset of the clocks", "s", 1.0),
@@ -126,6 +127,7 @@ def summary(job: CompareJob, found: Comparison) -> dict[str, Any]:
         "signs": dict(zip(("x", "y", "theta"), map(int, a.signs.tolist()), strict=True)),
         "rival_offset_s": a.rival_s,
         "sensors_over_track": _ratio(found),
+        "shared": _shared(found),
         "converged": a.converged,
         "errors": {"estimated_at_once": _sizes(a.errors), "nearest_points": _sizes(found.nearest)},
         "settings": dataclasses.asdict(job),
@@ -150,6 +152,15 @@ def _ratio(found: Comparison) -> float:
     m, s = moved[:, there], (moved - errors)[:, there]
     m, s = m - m.mean(0), s - s.mean(0)
     return float((m * s).sum() / m.square().sum())
+
+
+def _shared(found: Comparison) -> float:
+    """The share of the track's motion, as its variance, that the sensors tell: of the component that has most in common
+    with theirs."""
+    errors, moved = found.alignment.errors[found.alignment.valid], found.alignment.moved(found.track.pose)
+    there = errors.isfinite().all(0)
+    shares = 1 - errors[:, there].var(0) / moved[found.alignment.valid][:, there].var(0)
+    return float(shares.nan_to_num(0.0, 0.0, 0.0).max())
 
 
 def _signs(text: str) -> Signs:
@@ -237,6 +248,10 @@ def _remarks(figures: dict[str, Any]) -> list[str]:
     ratio = figures["sensors_over_track"]
     if math.isfinite(ratio) and not 1 / ODD < ratio < ODD:
         lines.append(f"The sensors move {ratio:.4g} times as far as the track: are the units and um_per_px right?")
+    if figures["shared"] < COMMON and math.isfinite(figures["estimated"]["offset_s"]["sigma"]):
+        lines.append(
+            f"Only {max(figures['shared'], 0.0):.0%} of the track's motion is the sensors', too: is it the same?"
+        )
     if figures["rival_offset_s"] is not None:
         offset = figures["rival_offset_s"]
         lines.append(f"An offset of {offset:.4f} s fits as well: the motion repeats itself, see --max-offset-s")
