@@ -74,7 +74,7 @@ def _opened(path: Path, options: dict[str, str]) -> Iterator[tuple[Any, Any]]:
         if container.format.name in _IMAGES:  # of which FFmpeg would read the first one only
             raise ValueError(f"open_frames: {path} is an image ({container.format.name[:4]}), give it such a name")
         stream = container.streams.best("video")
-        if stream is None or stream.codec_context is None or stream.disposition & _COVER:
+        if stream is None or stream.codec_context is None or stream.disposition.value & _COVER:
             raise ValueError(f"open_frames: {path} holds no video that can be decoded")
         stream.codec_context.options = options
         yield container, stream
