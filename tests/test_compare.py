@@ -180,6 +180,19 @@ def test_units_that_are_wrong_are_pointed_at(tmp_path):
     assert "times as far as the track: are the units and um_per_px right?" in done.output
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_two_motions_that_have_little_in_common_are_pointed_at(tmp_path):
+    track, sensors = write_track(tmp_path), write_sensors(tmp_path / "cds.csv")
+    words = re.compile(r"Only \d+% of the track's motion is the sensors', too: is it the same\?")
+    assert not words.search(run(track, sensors, "--template", 1, "--out", tmp_path / "same").output)
+    t, g = torch.arange(0, 3.5, 1 / 1024).double(), torch.Generator().manual_seed(1)
+    rates, phases = (scale * torch.rand(3, 6, 1, generator=g).double() for scale in (12, math.tau))
+    other = (rates * t + phases).sin().sum(1).T * torch.tensor([3.0, 3.0, 80.0])
+    lines = (",".join(f"{value:.9g}" for value in row) for row in torch.cat((t[:, None], other), 1).tolist())
+    (tmp_path / "other.csv").write_text("\n".join(("time_s,x_um,y_um,theta_urad", *lines)))
+    assert words.search(run(track, tmp_path / "other.csv", "--template", 1, "--out", tmp_path / "other").output)
+
+
 def test_what_did_not_converge_is_exit_2(tmp_path, monkeypatch):
     monkeypatch.setattr("torch_ecc.records.least_squares.SETTLED", -1.0)
     done = run(write_track(tmp_path), write_sensors(tmp_path / "cds.csv"), "--template", 1, "--out", tmp_path / "o")

@@ -292,6 +292,22 @@ def test_lost_frames_and_gaps_stay_in_the_result():
     assert found.valid.sum() >= (~gone).sum() - 8
 
 
+@pytest.mark.parametrize("ends", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_frames_at_the_edges_of_gaps_do_not_keep_it_from_ending(seed, ends):
+    """Twenty gaps of 50 ms, which begin, or end, where a frame lies by the offset that is found: so a step of any
+    size takes some of these frames in and leaves others out."""
+    track, sensors = records(20.0, seed)
+    s, found = sensors.time_s, align_records(track, sensors, NEAR)
+    for _ in range(3):
+        edges = track.time_s[60:440:20] + found.offset_s
+        after = (s[:, None] - edges) * (-1 if ends else 1)
+        kept = torch.cat((s[~((after > -1e-4) & (after < 0.05)).any(1)], edges)).sort().values
+        found = align_records(track, Motion(kept, truth(kept)), NEAR)
+    assert found.converged
+    assert abs(found.offset_s - OFFSET) < 4 * float(found.covariance[0, 0].sqrt()) < 1e-3
+
+
 def test_exposure_is_averaged_over():
     """Of a 20 Hz sine, an exposure T leaves sinc(f T)."""
     t, s = torch.arange(0.1, 4, 0.01).double(), torch.arange(0, 5, 1 / 4096).double()

@@ -47,6 +47,24 @@ def test_ome_zarr_has_axes(tmp_path):
     with pytest.raises(ValueError, match="2 channels and 3 slices, which are not time"):
         open_frames(tmp_path / "s.zarr")
     np.testing.assert_array_equal(stacked(tmp_path / "s.zarr", channel=1, slice=2), FRAMES[:, 1, 2])
+    source = open_frames(tmp_path / "s.zarr", channel=1, slice=2)
+    assert (source.fps, source.um_per_px, source.timed) == (None, None, False)
+
+
+def test_ome_zarr_tells_its_clock_and_scale(tmp_path):
+    zarr = pytest.importorskip("zarr")
+    group = zarr.open_group(str(tmp_path / "s.zarr"), mode="w")
+    group.create_array("0", data=FRAMES)
+    units = {"t": "millisecond", "z": "micrometer", "y": "nanometer", "x": "micrometer"}
+    axes = [{"name": name} | ({"unit": units[name]} if name in units else {}) for name in "tczyx"]
+    own = [{"type": "scale", "scale": [1, 1, 1, 300, 0.25]}]
+    common = [{"type": "translation", "translation": [0, 0, 0, 5, 5]}, {"type": "scale", "scale": [40, 1, 1, 1, 1]}]
+    images = [{"axes": axes, "datasets": [{"path": "0", "coordinateTransformations": own}]}]
+    group.attrs["multiscales"] = [images[0] | {"coordinateTransformations": common}]
+    source = open_frames(tmp_path / "s.zarr", channel=0, slice=1)
+    assert source.um_per_px == pytest.approx((0.25, 0.3))
+    assert source.fps == pytest.approx(25)
+    assert [frame.time_s for frame in source] == pytest.approx([0.04 * k for k in range(6)])
 
 
 class ND2File:

@@ -359,18 +359,31 @@ def test_a_turned_video_is_seen_as_it_is_shown(tmp_path):
 CINE_HEAD = "<2s3HiIiI3IQ"
 
 
-@pytest.mark.parametrize("levels", [NARROW, WIDE], ids=["8 bits", "16 bits"])
-def test_phantom_frames_have_the_times_of_their_own(tmp_path, levels):
-    """The camera ran at 90 kHz, and every tenth frame was saved: 0.3 s before the trigger."""
+PHANTOM = {
+    "8 bits": (NARROW, 8, (0, 0)),
+    "16 bits": (WIDE, 16, (0, 0)),
+    "12 bits": (WIDE >> 4, 12, (0, 0)),
+    "mirrored": (WIDE, 16, (1, 0)),
+    "turned over": (NARROW, 8, (1, 1)),
+}
+
+
+@pytest.mark.parametrize("name", PHANTOM)
+def test_phantom_frames_have_the_times_and_levels_of_their_own(tmp_path, name):
+    """The camera ran at 90 kHz, and every tenth frame was saved: 0.3 s before the trigger. Its user may have asked for
+    the picture to be flipped from left to right, or from top to bottom, or both."""
+    levels, bits, (across, down) = PHANTOM[name]
     setup, blocks, count, depth = 44 + 40, 44 + 40 + 6000, 6, levels.itemsize
     trigger = (1_700_000_000 << 32) + (1 << 31)
     times = [trigger + round((k / 9000 - 0.3) * 2**32) for k in range(count)]
     images = blocks + 8 + 8 * count + 8 * count
     head = struct.pack(CINE_HEAD, b"CI", 44, 0, 1, 0, count, 0, count, 44, setup, images - 8 * count, trigger)
-    bitmap = struct.pack("<IiiHHIIiiII", 40, 70, 48, 1, 8 * depth, 0, depth * 70 * 48, 0, 0, 0, 0)
+    bitmap = struct.pack("<IiiHHIIiiII", 40, 70, 48, 1, 8 * depth, 0, depth * 70 * 48, 0, 0, 0, 1 << bits)
     told = bytearray(6000)
     struct.pack_into("<H", told, 0, 9000)
     struct.pack_into("<2sH", told, 140, b"ST", 6000)
+    struct.pack_into("<2i", told, 756, across, down)
+    struct.pack_into("<I", told, 896, bits)
     block = struct.pack(f"<IHH{count}Q", 8 + 8 * count, 1002, 0, *times)
     size = 8 + depth * 70 * 48
     offsets = struct.pack(f"<{count}Q", *(images + k * size for k in range(count)))
@@ -379,7 +392,8 @@ def test_phantom_frames_have_the_times_of_their_own(tmp_path, levels):
     source = open_frames(tmp_path / "v.cine")
     assert source.fps == pytest.approx(9000, rel=1e-6)
     assert [frame.time_s for frame in source] == pytest.approx([k / 9000 - 0.3 for k in range(count)], abs=1e-9)
-    np.testing.assert_array_equal([frame.pixels.numpy() for frame in source], levels)
+    shown = levels[:, :: 1 - 2 * down, :: 1 - 2 * across]
+    np.testing.assert_array_equal([frame.pixels.numpy() for frame in source], shown)
 
 
 # ---- damage and attacks --------------------------------------------------------------------------------------------

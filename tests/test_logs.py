@@ -55,6 +55,7 @@ SHAPES = {
     "Excel": "Time (ms);x (mm);y (mm);theta (mrad)\n" + table(";", *COMMAS) + ";;;\n",
     "units below": "Time;x;y;theta\n[ms];[mm];[mm];[mrad]\n" + table(";", *COMMAS),
     "micro sign": "t;x [µm];y [µm];rz [µrad]\n" + table(";", *PLAIN),
+    "Greek": "t [s];x [µm];y [µm];θ_z [µrad]\n" + table(";", *PLAIN),
     "UTF-16": "Time [s]\tPos X (µm)\tPos Y (µm)\tTheta Z (µrad)\n" + table("\t", *PLAIN),
     "quoted": '"Time","X","Y"\n"ms","mm","mm"\n' + table(",", *([f'"{cell}"' for cell in c] for c in COMMAS[:3])),
     "thousands": "t;x [nm];y [nm]\n" + table(";", cells(T), thousands(1e3 * X), thousands(1e3 * Y)),

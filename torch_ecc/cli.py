@@ -35,7 +35,7 @@ TRACK_FORMS: dict[str, dict[str, Any]] = {  # of those options of TrackJob that 
     },
 }
 
-console = Console(highlight=False)
+console = Console(highlight=False, markup=False)  # names of files may look like markup
 
 TRACKING = options_of(TrackJob, without=("input",), **TRACK_FORMS)
 
@@ -108,11 +108,11 @@ def track(config: str | None, write_config: str | None, **options: Any) -> None:
     session = Session(fill(TrackJob, values, config or "track"))
     cv2.setNumThreads(1)  # OpenCV's wait for each other, spinning, longer than one picture keeps them busy
     for remark in session.remarks():
-        console.print(remark, soft_wrap=True, markup=False)
+        console.print(remark, soft_wrap=True)
     with progress_bar(session.source.name, session.source.length) as advance:
         finished = session.run(advance)
     for line in finished.words():
-        console.print(line, soft_wrap=True, markup=False)
+        console.print(line, soft_wrap=True)
     if finished.interrupted:
         if finished.frames:
             console.print("The same command with --resume goes on from there.")
@@ -134,14 +134,14 @@ def pick(port: int, browser: bool, **options: Any) -> None:
 
     stopped = serve(given(options), port, show=lambda url: _show(url, browser))
     for line in stopped:
-        console.print(line, soft_wrap=True, markup=False)
+        console.print(line, soft_wrap=True)
     if stopped:
         sys.exit(INTERRUPTED)
 
 
 def _show(url: str, browser: bool) -> None:
     """Tell people where the page is, and open it."""
-    console.print(f"The page: {url}", soft_wrap=True, markup=False)
+    console.print(f"The page: {url}", soft_wrap=True)
     console.print("Ctrl-C ends it.")
     if browser:
         click.launch(url)
@@ -160,7 +160,7 @@ def batch(recordings: tuple[str, ...], **options: Any) -> None:
     from torch_ecc.commands.batch import batch as run
 
     def say(words: str) -> None:
-        console.print(words, soft_wrap=True, markup=False)
+        console.print(words, soft_wrap=True)
 
     with progress_bar("batch") as advance:
         done = run(recordings, progress=advance, say=say, **given(options))
@@ -227,7 +227,7 @@ def _say_numbers(outcome: Any) -> None:
     for record in missed:
         sign = ">=" if record.better == "higher" else "<="
         text = f"  not kept: {record.name}: {record.value:.4g} {record.unit}, limit {sign} {record.tolerance:.4g}"
-        console.print(text, soft_wrap=True, markup=False)
+        console.print(text, soft_wrap=True)
 
 
 @app.command()
@@ -244,7 +244,7 @@ def compare(**options: Any) -> None:
 
     job = fill(CompareJob, given(options), "compare")
     figures = job_of.write(job, job_of.compare(job))
-    console.print(job_of.report(figures), markup=False, soft_wrap=True)
+    console.print(job_of.report(figures), soft_wrap=True)
     console.print(f"In {job.out}/: comparison.json, comparison.png, errors.csv")
     if not figures["converged"]:
         sys.exit(2)
@@ -306,7 +306,13 @@ class _Rate(ProgressColumn):
 def progress_bar(title: str, total: int | None = None, unit: str = "frames") -> Iterator[Callable[..., None]]:
     """A bar with the rate; yields a function that advances it by one, or sets (done, total) when given them. It shows
     once something is done: before, there may be an error to tell instead."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(unit), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(unit),
+        TimeRemainingColumn(),
+    )
     bar = Progress(*columns, console=Console(stderr=True))
     task = bar.add_task(title, total=total)
 
@@ -340,5 +346,7 @@ def main() -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """The words of an error with line ends and control codes, which names of files may hold, as escapes."""
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(error).strip())
+    """The words of an error, which may quote names of files."""
+    from torch_ecc.io.output import printable  # slow to import
+
+    return printable(str(error).strip())

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_ecc.commands.jobs import CompareJob
 from torch_ecc.core.pose import rotation
 from torch_ecc.io.comparison import TrackTable, read_sensors, read_track, write_table
-from torch_ecc.io.output import check_folder, part, publish
+from torch_ecc.io.output import check_folder, part, printable, publish
 from torch_ecc.io.summary import write_json
 from torch_ecc.plots import plot_comparison
 from torch_ecc.records.calibration import Calibration
@@ -22,6 +22,7 @@ from torch_ecc.records.motion import Motion, nearest_errors
 from torch_ecc.records.synchrony import Alignment, Unknowns, align_records
 
 UNITS = {"x_nm": 1e3, "y_nm": 1e3, "theta_urad": 1e6}
+COMMON = 0.5  # of two records of one motion; noise may be more than a small motion
 ODD = 1.1  # a ratio between the sizes of two records that no angle between the axes explains
 WORDS = {
     "offset_s": ("offset of the clocks", "s", 1.0),
@@ -126,6 +127,7 @@ def summary(job: CompareJob, found: Comparison) -> dict[str, Any]:
         "signs": dict(zip(("x", "y", "theta"), map(int, a.signs.tolist()), strict=True)),
         "rival_offset_s": a.rival_s,
         "sensors_over_track": _ratio(found),
+        "shared": _shared(found),
         "converged": a.converged,
         "errors": {"estimated_at_once": _sizes(a.errors), "nearest_points": _sizes(found.nearest)},
         "settings": dataclasses.asdict(job),
@@ -152,6 +154,15 @@ def _ratio(found: Comparison) -> float:
     return float((m * s).sum() / m.square().sum())
 
 
+def _shared(found: Comparison) -> float:
+    """The share of the track's motion, as its variance, that the sensors tell: of the component that has most in common
+    with theirs."""
+    errors, moved = found.alignment.errors[found.alignment.valid], found.alignment.moved(found.track.pose)
+    there = errors.isfinite().all(0)
+    shares = 1 - errors[:, there].var(0) / moved[found.alignment.valid][:, there].var(0)
+    return float(shares.nan_to_num(0.0, 0.0, 0.0).max())
+
+
 def _signs(text: str) -> Signs:
     """ "+-+" as 1, -1, 1."""
     x, y, theta = (1.0 if sign == "+" else -1.0 for sign in text)
@@ -175,7 +186,7 @@ def write(job: CompareJob, found: Comparison) -> dict[str, Any]:
         "sensors": found.sensors.pose,
         "nearest": found.nearest,
     }
-    title = f"{Path(job.track).name} and {Path(job.sensors).name}"
+    title = printable(f"{Path(job.track).name} and {Path(job.sensors).name}")
     plot_comparison({name: tensor.numpy() for name, tensor in drawn.items()}, folder / "comparison.png", title=title)
     publish(folder, "errors.csv", "comparison.json")
     return figures
@@ -237,6 +248,10 @@ def _remarks(figures: dict[str, Any]) -> list[str]:
     ratio = figures["sensors_over_track"]
     if math.isfinite(ratio) and not 1 / ODD < ratio < ODD:
         lines.append(f"The sensors move {ratio:.4g} times as far as the track: are the units and um_per_px right?")
+    if figures["shared"] < COMMON and math.isfinite(figures["estimated"]["offset_s"]["sigma"]):
+        lines.append(
+            f"Only {max(figures['shared'], 0.0):.0%} of the track's motion is the sensors', too: is it the same?"
+        )
     if figures["rival_offset_s"] is not None:
         offset = figures["rival_offset_s"]
         lines.append(f"An offset of {offset:.4f} s fits as well: the motion repeats itself, see --max-offset-s")

@@ -38,6 +38,7 @@ class Run:
         self.tracker, self.track, self.films, self.body = tracker, track, films, body
         self.stop_at_damage = stop_at_damage
         self.latency = Latency()
+        self.damage = ""
         self.done, self.damaged, self.reasons = 0, 0, np.zeros(len(Reason), np.int64)
         self.lost, self.last = np.zeros(len(tracker.start), np.int64), np.zeros(len(tracker.start), np.int8)
         # What the next frame depends on: all of it goes into the journal with every frame.
@@ -78,6 +79,7 @@ class Run:
         except ValueError as error:
             if self.stop_at_damage:
                 raise ValueError(f"frame {frame.number}: {error}") from error
+            self.damage = self.damage or f"frame {frame.number} ({error})"
             return dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
         self.latency.add(frame)
         return frame, estimate
@@ -97,10 +99,10 @@ class Run:
         return b"" if before == self._versions else b"".join(part.cpu().numpy().tobytes() for part in self._seldom)
 
     @property
-    def counts(self) -> tuple[int, int, NDArray[np.int64], NDArray[np.int8], NDArray[np.int64]]:
-        """Frames done, of which damaged, in how many of the others each template was lost and why last (R,), and how
-        many rows each reason stands in."""
-        return self.done, self.damaged, self.lost, self.last, self.reasons
+    def counts(self) -> tuple[int, int, str, NDArray[np.int64], NDArray[np.int8], NDArray[np.int64]]:
+        """Frames done, of which damaged, the first of these in words, in how many of the others each template was lost
+        and why last (R,), and how many rows each reason stands in."""
+        return self.done, self.damaged, self.damage, self.lost, self.last, self.reasons
 
     def _count(self, status: NDArray[np.int8], reason: NDArray[np.int8]) -> None:
         """Frames more with ``status`` and ``reason`` (F, R)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
@@ -42,12 +43,14 @@ NOT_OF_THE_RESULT = ("out", "force", "resume", "send")
 
 
 class Finished(NamedTuple):
-    """What became of a run: ``frames`` done, of which so many ``damaged``, how many each template was lost in of the
-    others and what speaks against its last pose (R,), how many rows each reason stands in, in the order of Reason, the
-    folder, whether it was stopped from the keyboard or by a signal, and how late poses of a camera's frames were."""
+    """What became of a run: ``frames`` done, of which so many ``damaged``, the first as ``damage`` says ("" if it came
+    before the run went on), how many each template was lost in of the others and what speaks against its last pose
+    (R,), how many rows each reason stands in, in the order of Reason, the folder, whether it was stopped from the
+    keyboard or by a signal, and how late poses of a camera's frames were."""
 
     frames: int
     damaged: int
+    damage: str
     lost: NDArray[np.int64]
     last_reason: NDArray[np.int8]
     reasons: NDArray[np.int64]
@@ -59,15 +62,22 @@ class Finished(NamedTuple):
         """The same in sentences."""
         said = self._losses()
         if self.damaged:
-            said.append(f"{self.damaged} of {self.frames} frames are damaged: track.csv says which and why")
+            example = f", as {self.damage}" if self.damage else ""
+            said.append(f"{self.damaged} of {self.frames} frames are damaged{example}: track.csv says which and why")
         counts = sorted(zip(self.reasons.tolist(), Reason, strict=True), key=lambda each: -each[0])
         if reasons := [f"{n} {code.name.lower().replace('_', ' ')}" for n, code in counts if n and code]:
             rows, doubted = int(self.reasons.sum()), int(self.reasons[1:].sum())
             said.append(f"{doubted} of {rows} rows are not to be trusted: {', '.join(reasons)}")
-        said += [*told(self.folder), *self.latency.words()]
+        said += [*told(self.folder), *self._clock(), *self.latency.words()]
         whole = sorted(path.name for path in self.folder.iterdir() if path.suffix != ".part") if self.frames else []
         end, names = "Stopped after" if self.interrupted else "Tracked", ", ".join(whole) or "nothing"
         return [*said, f"{end} {self.frames} frames. In {self.folder}/: {names}"]
+
+    def _clock(self) -> list[str]:
+        """What is said of times that are none."""
+        path = self.folder / "summary.json"
+        back = json.loads(path.read_text(encoding="utf-8"))["times_that_do_not_go_on"] if path.is_file() else 0
+        return [f"The time of {back} frames is not later than that of the frame before: --fps tells it"] if back else []
 
     def _losses(self) -> list[str]:
         """What is said of templates that were lost: a line of each, or one of all if they are many."""

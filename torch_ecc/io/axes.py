@@ -28,6 +28,10 @@ class Walk(NamedTuple):
     start: int
     step: int
 
+    @property
+    def planes(self) -> list[int]:
+        return [self.start + number * self.step for number in range(self.length)]
+
 
 def walk(where: str, axes: str, sizes: Sequence[int], choice: Choice, *, loose: bool = False) -> Walk:
     """Through time, for the ``choice``, along the ``axes`` of the planes (T, C, Z, P ..., one letter each).

@@ -22,7 +22,8 @@ NAMES = {
     "time": {"time", "t", "timestamp", "timestamps", "elapsed", "zeit", "datetime", "dateandtime", "epoch", "clock"},
     "x": {"x"},
     "y": {"y"},
-    "theta": {"theta", "thetaz", "rz", "rotz", "phi", "angle", "yaw", "rotation"},
+    "theta": {"theta", "thetaz", "rz", "rotz", "phi", "angle", "yaw", "rotation"}
+    | {f"{letter}{axis}" for letter in "θϑφϕ" for axis in ("", "z")},
 }
 FILLERS = {"pos", "position", "positions", "stage", "sensor", "axis", "cds", "value", "actual", "measured", "elapsed"}
 EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # a number so large counts these since 1970

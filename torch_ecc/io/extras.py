@@ -3,6 +3,7 @@ there is none here, a sentence that names it."""
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
@@ -32,6 +33,8 @@ CONVERTERS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """What reads the formats that are not read here."""
 
+_UNITS = {"second": 1.0, "millisecond": 1e-3, "microsecond": 1e-6, "minute": 60.0, "hour": 3600.0}
+_UNITS |= {"micrometer": 1.0, "nanometer": 1e-3, "millimeter": 1e3, "meter": 1e6}
 _LETTERS = {"λ": "C", "Λ": "C"}  # of axes that a format calls by another one
 
 
@@ -139,12 +142,27 @@ def _open_zarr(zarr: Any, path: Path, choice: Choice) -> Medium:
         return open_stack(_only({name: array for name, array in root.arrays() if array.ndim > 2}, path.name), path.name)
     array = root[told[0]["datasets"][0]["path"]]
     axes = "".join(str(each["name"] if isinstance(each, dict) else each)[0].upper() for each in told[0]["axes"])
-    outer = array.shape[:-2]
+    outer, steps = array.shape[:-2], _steps(told[0])
 
     def read(plane: int) -> tuple[Pixels, float | None]:
-        return np.asarray(array[np.unravel_index(plane, outer)] if outer else array[:]).copy(), None
+        at = np.unravel_index(plane, outer)
+        time_s = float(at[axes.index("T")]) * steps["T"] if "T" in steps else None
+        return np.asarray(array[at] if outer else array[:]).copy(), time_s
 
-    return _medium(path.name, axes[:-2], outer, choice, read)
+    medium = _medium(path.name, axes[:-2], outer, choice, read)
+    rate = 1 / steps["T"] if "T" in steps else None
+    return medium._replace(fps=rate, um_per_px=(steps["X"], steps["Y"]) if {"X", "Y"} <= steps.keys() else None)
+
+
+def _steps(image: Mapping[str, Any]) -> dict[str, float]:
+    """How far the planes and pixels of an OME-Zarr image are apart in s and um, by letters of axes, where it tells."""
+    axes, steps = image["axes"], np.ones(len(image["axes"]))
+    for owner in (image, image["datasets"][0]):
+        for change in owner.get("coordinateTransformations", ()):
+            steps = steps * change["scale"] if change.get("type") == "scale" else steps
+    units = [_UNITS.get(str(axis.get("unit")), 0.0) if isinstance(axis, dict) else 0.0 for axis in axes]
+    told = zip(axes, (steps * units).tolist(), strict=True)
+    return {str(axis["name"])[0].upper(): step for axis, step in told if 0 < step < math.inf}
 
 
 def _only(stacks: Mapping[str, Any], where: str) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, NamedTuple, TypeAlias, overload
@@ -18,6 +18,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from torch_ecc.io.output import printable
 
 Pixels: TypeAlias = NDArray[Any]
 """One frame as it was stored: (H, W) or (H, W, channels), RGB or RGBA order, any real dtype."""
@@ -118,7 +120,7 @@ class FrameSource:
     def __init__(self, name: str, medium: Medium, *, fps: float | None = None, numbers: range | None = None) -> None:
         self._medium, self._rate = medium, fps
         self._numbers = _numbers(medium, slice(None)) if numbers is None else numbers
-        self.name, self.notes, self.um_per_px, self.live = name, medium.notes, medium.um_per_px, medium.live
+        self.name, self.notes, self.um_per_px, self.live = printable(name), medium.notes, medium.um_per_px, medium.live
         self.fps, self.length = medium.fps if fps is None else fps, _length(medium, self._numbers)
         # Frames are read up to the first good one, for its shape, and not read again: a camera goes on.
         stream, begun = medium.read(self._numbers), []
@@ -233,6 +235,13 @@ def brief(error: BaseException) -> str:
     """The error of a library in one short line, by its name if it has no words."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[0] if len(lines[0]) <= _LONGEST else f"{lines[0][:_LONGEST]} ..."
+
+
+def nominal_rate(times: Iterable[float]) -> float | None:
+    """Frames per second of most of them, at ``times`` in s: gaps, and a time that is wrong, do not count."""
+    steps = np.diff(np.asarray(list(times)))
+    step = float(np.median(steps)) if len(steps) else 0.0
+    return 1 / step if step > 0 else None
 
 
 def check_dtype(dtype: np.dtype[Any], where: str) -> None:

@@ -77,7 +77,7 @@ def grey(packet: Any, width: int, height: int, tint: Tint) -> Jpeg | None:
 
 def is_plain(packet: Any, frame: av.VideoFrame) -> bool:
     """Is what FFmpeg has made of a packet, to rounding, what is found by ``grey``, and shown as it is?"""
-    if frame.rotation or frame.color_range != ColorRange.JPEG:
+    if frame.side_data.get("DISPLAYMATRIX") is not None or frame.color_range != ColorRange.JPEG:
         return False
     found, plane = grey(packet, frame.width, frame.height, Tint()), frame.planes[0]
     if found is None or plane.line_size < frame.width:

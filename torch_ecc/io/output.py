@@ -23,6 +23,11 @@ def check_folder(path: str | Path, who: str) -> Path:
     return folder
 
 
+def printable(text: str) -> str:
+    """Line ends and control codes, which names of files may hold, as escapes."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+
+
 def part(folder: Path, name: str) -> Path:
     """Where ``name`` is written until it is whole."""
     return folder / f"{name}.part"

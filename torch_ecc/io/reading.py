@@ -61,7 +61,8 @@ def _open(source: str | Path | int | Stack | Camera, choice: Choice) -> tuple[st
         name = f"{type(source).__name__}"
         check_single(name, choice)
         return name, open_stack(source, name)
-    text = str(source).strip()
+    text = str(source)
+    text = text if Path(text).expanduser().exists() else text.strip()  # a name may begin or end with a space
     path = Path(text).expanduser()
     if not isinstance(source, int) and text and path.exists():  # a folder named by digits is no camera
         return path.name or str(path), _open_path(path, choice)

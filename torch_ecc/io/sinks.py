@@ -59,7 +59,7 @@ def left(folder: Path, name: str) -> int:
 
 def _sizes(stream: Path) -> list[int]:
     """Bytes of each picture of a bare stream, of which the last may be cut off."""
-    with suppress(av.FFmpegError), av.open(str(stream), format=_STREAM) as video:
+    with suppress(av.FFmpegError), av.open(str(stream.absolute()), format=_STREAM) as video:
         return [packet.size for packet in video.demux(video=0) if packet.size]
     return []
 
@@ -117,8 +117,8 @@ class _Video:
         """The same pictures in a container, whose index comes first, so that it plays while it loads."""
         create(film).close()
         with (
-            av.open(str(stream), format=_STREAM) as source,
-            av.open(str(film), "w", format="mp4", options={"movflags": "+faststart"}) as target,
+            av.open(str(stream.absolute()), format=_STREAM) as source,
+            av.open(str(film.absolute()), "w", format="mp4", options={"movflags": "+faststart"}) as target,
         ):
             video = target.add_stream_from_template(source.streams.video[0])
             video.time_base = 1 / self._pace

@@ -33,6 +33,7 @@ class Tally:
         self._codes = {field: np.zeros((templates, _CODES), np.int64) for field in names}
         self._first, self._last = np.full((2, templates), _NEVER)
         self._score, self._coverage, self._found = np.zeros((3, templates))
+        self._clock, self._back = -math.inf, 0
         self._least, self._drift = np.full(templates, math.inf), np.full((templates, 3), math.nan)
 
     def add(self, records: NDArray[Any]) -> None:
@@ -51,9 +52,17 @@ class Tally:
         self._last = np.where(last != _NEVER, self._frames + last, self._last)
         moved = records["displacement"][seen, np.arange(len(seen))]
         self._drift = np.where((seen != _NEVER)[:, None], moved, self._drift)
+        self._time(records)
         some = records["covariance"][-self._frames % self._apart :: self._apart]
         self._variances.append(np.diagonal(some, axis1=-2, axis2=-1).copy())
         self._frames += len(records)
+
+    def _time(self, records: NDArray[Any]) -> None:
+        """Count the times that are not later than the one before."""
+        told = records["time_s"] if "time_s" in (records.dtype.names or ()) else np.empty(0)
+        times = np.append(self._clock, told[np.isfinite(told)])
+        self._back += int((np.diff(times) <= 0).sum())
+        self._clock = times[-1]
 
     def summary(self, error: BaseException | None) -> dict[str, object]:
         """Of all that was added; ``error`` is what ended the run before its time, if anything did."""
@@ -64,6 +73,7 @@ class Tally:
             "reason": _describe(error),
             "frames": self._frames,
             "damaged_frames": int(status[0, self._saying(DAMAGED)].sum()),
+            "times_that_do_not_go_on": self._back,
             "templates": len(status),
             "rows": self._frames * len(status),
             "reasons": self._counted("reason"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
+
+from torch_ecc.io.frames import nominal_rate
 
 _UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "\\u00b5m": 1.0, "micron": 1.0, "microns": 1.0, "mm": 1e3, "m": 1e6}
 _SECONDS = {"ms": 1e-3, "msec": 1e-3, "s": 1.0, "sec": 1.0, "second": 1.0, "min": 60.0, "h": 3600.0, "hour": 3600.0}
@@ -20,11 +22,11 @@ class Tags(NamedTuple):
     time_s: Callable[[int, int], float | None] = lambda frame, plane: None
 
 
-def read_tags(tif: Any, position: int) -> Tags:
-    """Of a file, whose stage ``position`` is read. What is there and makes no sense is passed over."""
+def read_tags(tif: Any, position: int, planes: Sequence[int]) -> Tags:
+    """Of a file, whose ``planes`` of a stage ``position`` are read. What is there and makes no sense is passed over."""
     for read in (_ome, _lsm, _imagej, _micro_manager):
         try:
-            tags = read(tif, position)
+            tags = read(tif, position, planes)
         except (ET.ParseError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
             continue
         if tags is not None:
@@ -43,7 +45,7 @@ def _scale(x: float, y: float) -> tuple[float, float] | None:
     return (x, y) if 0 < x < math.inf and 0 < y < math.inf else None
 
 
-def _imagej(tif: Any, _: int) -> Tags | None:
+def _imagej(tif: Any, _: int, __: Sequence[int]) -> Tags | None:
     if tif.imagej_metadata is None:
         return None
     told, page = tif.imagej_metadata, tif.pages.first
@@ -56,7 +58,7 @@ def _imagej(tif: Any, _: int) -> Tags | None:
     return Tags(scale, fps, time_s)
 
 
-def _ome(tif: Any, position: int) -> Tags | None:
+def _ome(tif: Any, position: int, planes: Sequence[int]) -> Tags | None:
     if tif.ome_metadata is None:
         return None
     root = ET.fromstring(tif.ome_metadata)
@@ -70,7 +72,8 @@ def _ome(tif: Any, position: int) -> Tags | None:
         scale = _scale(x, y)
     times = _ome_times(pixels)
     if times:
-        return Tags(scale, _mean_rate(list(times.values())), lambda frame, plane: times.get(plane))
+        rate = nominal_rate(times[plane] for plane in planes if plane in times)
+        return Tags(scale, rate, lambda frame, plane: times.get(plane))
     return Tags(scale, *_every(float(told.get("TimeIncrement", 0)) * _SECONDS[told.get("TimeIncrementUnit", "s")]))
 
 
@@ -90,16 +93,16 @@ def _ome_times(pixels: ET.Element) -> dict[int, float]:
     return times
 
 
-def _lsm(tif: Any, _: int) -> Tags | None:
+def _lsm(tif: Any, _: int, __: Sequence[int]) -> Tags | None:
     if tif.lsm_metadata is None:
         return None
     told = tif.lsm_metadata
     times = [float(each) for each in told.get("TimeStamps", ())]
     scale = _scale(told["VoxelSizeX"] * 1e6, told["VoxelSizeY"] * 1e6)
-    return Tags(scale, _mean_rate(times), lambda frame, plane: times[frame] if frame < len(times) else None)
+    return Tags(scale, nominal_rate(times), lambda frame, plane: times[frame] if frame < len(times) else None)
 
 
-def _micro_manager(tif: Any, _: int) -> Tags | None:
+def _micro_manager(tif: Any, _: int, __: Sequence[int]) -> Tags | None:
     if not tif.is_micromanager:
         return None
 
@@ -116,8 +119,3 @@ def _micro_manager(tif: Any, _: int) -> Tags | None:
 
     size = float(told(0).get("PixelSizeUm", 0))
     return Tags(_scale(size, size), None, time_s)
-
-
-def _mean_rate(times: list[float]) -> float | None:
-    span = max(times) - min(times) if times else 0.0
-    return (len(times) - 1) / span if span > 0 else None

@@ -53,7 +53,7 @@ def open_tiff(path: Path, choice: Choice) -> Medium:
     if page.dtype is not None:
         check_dtype(page.dtype, path.name)
     planes = _described(tif, path, choice) or _pages(tif, path, choice)
-    tags, lock = read_tags(tif, planes.position), threading.Lock()
+    tags, lock = read_tags(tif, planes.position, planes.walk.planes), threading.Lock()
 
     def read(numbers: range) -> Iterator[Raw]:
         length, start, step = planes.walk
@@ -211,7 +211,7 @@ def _page(page: Any, path: Path) -> Pixels:
     if colours != "PALETTE" or page.parent.is_imagej or page.parent.is_ome:  # to these two a palette is for the eye
         return pixels
     palette: Pixels = np.moveaxis(keyframe.colormap >> 8, 0, -1).astype(np.uint8)
-    return palette[pixels.astype(np.uint16)]
+    return palette[(pixels if keyframe.samplesperpixel == 1 else pixels[..., 0]).astype(np.uint16)]  # without opacity
 
 
 def _by_pillow(path: Path, page: Any, reason: str) -> Pixels:

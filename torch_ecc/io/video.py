@@ -22,6 +22,10 @@ _KINDS = "3gp asf avi dv flv h264 hevc ivf m2ts m4v mjpeg mjpg mkv mov mp4 mpeg 
 VIDEOS = frozenset(f".{kind}" for kind in _KINDS.split())
 _SLACK_FRAMES, _SLACK = 3, 0.02
 _STRICT = {"err_detect": "explode"}  # a frame that is damaged is told, and not made up from its neighbours
+_FROM_ZERO = ("matroska,webm", "nut", "asf")  # that declare when they end, and not how long they last
+_WIDENED = ("gray16le", "gray16be")
+_IMAGES = ("tiff_pipe", "webp_pipe")
+_COVER = 1024  # in the disposition of a stream: the picture on the sleeve of a sound
 _PACKED = {"yuyv422": 0, "yvyu422": 0, "uyvy422": 1}  # where the first luma byte stands among chroma bytes
 
 _PLANAR = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p")
@@ -33,10 +37,12 @@ _Decoded: TypeAlias = "av.VideoFrame | Jpeg | str"
 
 
 class _Way(NamedTuple):
-    """How a file is decoded: FFmpeg's ``options``, and the size of frames of motion JPEG that are ``plain``."""
+    """How a file is decoded: FFmpeg's ``options``, the size of frames of motion JPEG that are ``plain``, and the bits
+    by which FFmpeg has ``widened`` raw levels."""
 
     options: dict[str, str]
     plain: tuple[int, int] | None
+    widened: int
 
 
 def open_video(path: Path) -> Medium:
@@ -44,12 +50,15 @@ def open_video(path: Path) -> Medium:
     with _opened(path, _STRICT) as (container, stream):
         check_size(f"open_frames: {path}", stream.width, stream.height)
         fps, length = _rate(container, stream), _declared(container, stream)
-        ratio = stream.sample_aspect_ratio or 1
+        ratio, others = stream.sample_aspect_ratio or 1, len(container.streams.video) - 1
+        bits = stream.codec_context.bits_per_coded_sample if stream.codec_context.name == "rawvideo" else 0
+        widened = 16 - bits if stream.codec_context.pix_fmt in _WIDENED and 8 < bits < 16 else 0
         first = next((frame for _, frame in _decoded(container, stream)), "")
     # Some writers never close an image as their standard wants it: a decoder that is strict would refuse every frame.
-    way = _Way({} if isinstance(first, str) else _STRICT, _plain_size(path))
+    way = _Way({} if isinstance(first, str) else _STRICT, _plain_size(path), widened)
     uneven = f"{path.name}: its pixels are not square, they are {float(ratio):.4g} times as wide as high"
-    notes = (uneven,) if ratio != 1 else ()
+    beside = f"{path.name}: of its {others + 1} videos the one of {stream.width} x {stream.height} px is read"
+    notes = (uneven,) * (ratio != 1) + (beside,) * (others > 0)
     return Medium(lambda numbers: _read(path, way, numbers), length or None, fps, notes=notes, exact=False)
 
 
@@ -57,13 +66,15 @@ def open_video(path: Path) -> Medium:
 def _opened(path: Path, options: dict[str, str]) -> Iterator[tuple[Any, Any]]:
     """The container and its video stream."""
     try:
-        container = av.open(str(path))
+        container = av.open(str(path.absolute()))  # of other names what stands before a colon would be a protocol
     except (av.FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or brief(error)
         raise ValueError(f"open_frames: {path} cannot be opened as a video ({reason})") from error
     with container:
+        if container.format.name in _IMAGES:  # of which FFmpeg would read the first one only
+            raise ValueError(f"open_frames: {path} is an image ({container.format.name[:4]}), give it such a name")
         stream = container.streams.best("video")
-        if stream is None or stream.codec_context is None:
+        if stream is None or stream.codec_context is None or stream.disposition.value & _COVER:
             raise ValueError(f"open_frames: {path} holds no video that can be decoded")
         stream.codec_context.options = options
         yield container, stream
@@ -77,7 +88,9 @@ def _rate(container: Any, stream: Any) -> float | None:
 
 def _declared(container: Any, stream: Any) -> int:
     """How many frames the container says it shows, 0 if it does not."""
-    fps, seconds, frames = _rate(container, stream), (container.duration or 0) / av.time_base, int(stream.frames)
+    begun = (container.start_time or 0) if container.format.name in _FROM_ZERO else 0
+    fps, seconds = _rate(container, stream), max((container.duration or 0) - begun, 0) / av.time_base
+    frames = int(stream.frames)
     by_time = round(seconds * fps) if fps else 0
     if not frames:
         return by_time if len(container.streams) == 1 else 0  # the duration may be that of a longer sound
@@ -103,7 +116,7 @@ def _read(path: Path, way: _Way, numbers: range) -> Iterator[Raw]:
                 return
             last = time_s if time_s is not None and fps else (count / fps if fps else 0.0)
             if count in numbers:
-                yield _raw(count, frame, last if fps else None)
+                yield _raw(count, frame, last if fps else None, way.widened)
             count += 1
         # Counted in time and with some slack: what containers declare is exact for some and an estimate for others.
         declared, start = _declared(container, stream), float((stream.start_time or 0) * (stream.time_base or 0))
@@ -149,7 +162,7 @@ def _decoded(
     yield from damaged
 
 
-def _raw(number: int, frame: _Decoded, time_s: float | None) -> Raw:
+def _raw(number: int, frame: _Decoded, time_s: float | None, widened: int) -> Raw:
     if isinstance(frame, str):
         return Raw(number, frame, time_s)
     if isinstance(frame, Jpeg):
@@ -158,12 +171,18 @@ def _raw(number: int, frame: _Decoded, time_s: float | None) -> Raw:
     if gray is None:
         return Raw(number, _upright(_rgb(frame), frame), time_s)
     colours = (lambda: _upright(_shown(frame), frame)) if len(frame.format.components) > 1 else None
-    return Raw(number, _upright(gray, frame), time_s, colours=colours)
+    return Raw(number, _upright(gray >> widened if widened else gray, frame), time_s, colours=colours)
 
 
 def _upright(pixels: Pixels, frame: av.VideoFrame) -> Pixels:
-    """Turned as the file wants it shown."""
-    return np.rot90(pixels, frame.rotation // 90) if frame.rotation else pixels
+    """Turned and mirrored as the file wants it shown, by quarters of a turn."""
+    told: Any = frame.side_data.get("DISPLAYMATRIX")
+    if told is None:
+        return pixels
+    (a, b, _), (c, d, _), _ = np.frombuffer(told, np.int32).reshape(3, 3).tolist()  # x' = a x + c y, y' = b x + d y
+    if abs(b) > abs(a):
+        pixels, a, d = pixels.swapaxes(0, 1), c, b
+    return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
 
 
 def _luma(frame: av.VideoFrame) -> Pixels | None:
@@ -206,7 +225,9 @@ def _bytes(plane: VideoPlane) -> Pixels:
 
 def _rgb(frame: av.VideoFrame) -> Pixels:
     """(H, W, 3), of 16 bits where the frame has more than 8."""
-    deep = any(each.bits > 8 for each in frame.format.components)
+    # Of a Bayer pattern each colour has its share of the bits.
+    bits = [each.bits for each in frame.format.components]
+    deep = (sum(bits) if frame.format.is_bayer else max(bits)) > 8
     if not hasattr(_conversion, "own"):
         _conversion.own = VideoReformatter()
     made: av.VideoFrame = _conversion.own.reformat(frame, format="rgb48le" if deep else "rgb24")

@@ -55,8 +55,10 @@ def _draw(lines: list[list[Any]], texts: list[tuple[int, str, str, bool]], path:
         axes.add_collection(LineCollection(placed, colors=colour, linewidths=0.9))
     for number, title, words, failed in texts:
         x, y = number % columns + 0.04, number // columns
-        axes.text(x, y + 0.06, _short(title, 34), size=7.5, va="top", weight="bold", clip_on=False)
-        axes.text(x, y + 0.98, _short(words, 46), size=6.2, va="bottom", color="#b02020" if failed else "#555555")
+        plain: Any = {"parse_math": False}  # a name may hold dollars
+        axes.text(x, y + 0.06, _short(title, 34), size=7.5, va="top", weight="bold", clip_on=False, **plain)
+        colour = "#b02020" if failed else "#555555"
+        axes.text(x, y + 0.98, _short(words, 46), size=6.2, va="bottom", color=colour, **plain)
     figure.text(0.01, 1 - 0.06 / figure.get_figheight(), "displacement: ", size=8, va="top")
     for k, name in enumerate(("x", "y", "θ")):
         figure.text(

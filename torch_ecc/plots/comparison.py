@@ -48,7 +48,9 @@ def plot_comparison(records: Mapping[str, ArrayLike], path: str | Path, *, title
         _draw_errors(axis, data, k)
     rows[-1].set_xlabel("time of the track (s)")
     right.legend(*rows[0].get_legend_handles_labels(), ncols=2, loc="outside upper left")
-    figure.suptitle(title or f"{len(data['time_s']):,} frames, {len(data['sensor_time_s']):,} sensor samples")
+    figure.suptitle(
+        title or f"{len(data['time_s']):,} frames, {len(data['sensor_time_s']):,} sensor samples", parse_math=False
+    )
     return save(figure, Path(path), dpi)
 
 

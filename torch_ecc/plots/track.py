@@ -153,7 +153,9 @@ def _annotate(figure: Figure, data: Drawn, colours: list[Any], title: str) -> No
     frames, templates = data.frames, data.status.shape[1]
     count = f"{frames:,} frame{'s' * (frames > 1)}, {templates} template{'s' * (templates > 1)}"
     _, height = figure.get_size_inches()
-    figure.suptitle(f"{title}   ({count})" if title else count, fontsize=13, y=1 - 0.15 / height, va="top")
+    figure.suptitle(
+        f"{title}   ({count})" if title else count, fontsize=13, y=1 - 0.15 / height, va="top", parse_math=False
+    )
     if templates > len(_COLOURS):
         norm = Normalize(0, templates - 1)
         bar = figure.add_axes((0.945, _BOTTOM / height, 0.01, 1 - (_BOTTOM + _TOP) / height))

@@ -18,7 +18,7 @@ from torch_ecc.records.whitening import autoregression, whiten
 
 FLOOR = (1e-6, 1e-6, 1e-9)  # um, um, rad: below this a record is exact
 STEPS = 50
-SETTLED = 0.1  # standard deviations: frames at the edge of a gap, in one step and not in the next, move no less
+SETTLED = 0.1  # standard deviations that the last step may still have
 PARTS = 10  # of a record, whose means say how well the mean of all is known
 LEARNING = 4  # steps in which the description of the errors still follows them
 

@@ -149,7 +149,14 @@ def align_records(track: Motion, sensors: Motion, unknowns: Unknowns | None = No
     near = Motion(track.time_s - first, track.pose), Motion(sensors.time_s - shift - first, sensors.pose)
     model, near_s = _Model(*near, unknowns), 0.0 if shift else NEAR_S  # of clocks that are apart nothing is known
     chosen, rival = _choose(_fits(model, near_s), track.period_s, near_s)
-    p, covariance, converged = least_squares(lambda q: model(q, chosen.signs)[:2], chosen.p, model.free, ZEROS)
+    both = torch.ones_like(track.found)
+
+    def common(q: Tensor) -> tuple[Tensor, Tensor]:
+        residual, jacobian, valid = model(q, chosen.signs)
+        both.logical_and_(valid)  # a frame that has once lain in a gap stays out, or it might come and go for ever
+        return residual[both[valid]], jacobian[both[valid]]
+
+    p, covariance, converged = least_squares(common, chosen.p, model.free, ZEROS)
     residual, _, valid = model(p, chosen.signs)
     errors = torch.full_like(track.pose, math.nan)
     errors[valid] = torch.where(model.components, residual, math.nan)
