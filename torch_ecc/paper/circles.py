@@ -52,7 +52,7 @@ class Round(NamedTuple):
 
 @simulated_once
 def rounds(quick: bool, advance: Advance) -> list[Round]:
-    """Both circles; simulated at the first call only. ``quick``: three times as fast, and a smaller part of the sensor."""
+    """Both circles; simulated at the first call only. ``quick``: in 3 s, and a smaller part of the sensor."""
     bench = Bench(microscope(quick, zoom=ZOOM))
     commands = {radius: command(radius, 3.0 if quick else 10.0) for radius in RADII}
     tick = counter(sum(map(bench.frames, commands.values())), advance)
