@@ -225,15 +225,15 @@ def gradient_cost(frames: list[Tensor], place: torch.device, count: int, size: i
     return Number(name, share, "", "lower", 0.3)
 
 
-def moving(device: torch.device, count: int = 60) -> list[Tensor]:
+def moving(device: torch.device, count: int) -> list[Tensor]:
     """Frames (H, W) of a slow movement, and those of the way back."""
     views = list(Sequence(SCENE, Harmonic(3.0, 1.0, count).closed(), Camera()))
     return [view.to(device).reshape(FRAME) for view in (*views, *views[-2:0:-1])]
 
 
-def whole_trackers(place: torch.device, counts: list[int], size: int) -> list[Number]:
+def whole_trackers(place: torch.device, counts: list[int], size: int, frames_each_way: int) -> list[Number]:
     """Of the fewest and the most templates; of the fewest under covers and from a file too."""
-    frames, few = moving(place), counts[0]
+    frames, few = moving(place, frames_each_way), counts[0]
     figures = [number for count in sorted({few, counts[-1]}) for number in tracked(frames, place, count, size)]
     return [*figures, *tracked(frames, place, few, size, covered=True), *from_video(frames, place, few, size)]
 
@@ -330,7 +330,7 @@ def main(
     engines = dict.fromkeys(backend for backend, _ in (WAYS[way] for way in ways))
     some = {counts[0], min(counts[-1], CHECKED)} if minutes > 0 else ()
     if minutes > 0:
-        figures += whole_trackers(place, counts, sizes[-1])
+        figures += whole_trackers(place, counts, sizes[-1], 6 * frames)
     figures += [gradient_cost(views, place, count, sizes[-1], backend) for backend in engines for count in some]
     while left and time.monotonic() < end:
         case = left.pop(0)

@@ -83,8 +83,9 @@ def surfaces(frames: int, seeds: int, families: Iterable[str]) -> Iterator[Numbe
         for change in ageing.CHANGES:
             if change == "wave by wave" and family != "waves":
                 continue
+            films = [list(ageing.changing(family, change, seed, frames)) for seed in range(seeds)]
             for title, options in (("as it was", {}), (f"renew {RENEW}", {"renew": RENEW})):
-                runs = [follow(ageing.changing(family, change, seed, frames), **options) for seed in range(seeds)]
+                runs = [follow(iter(film), **options) for film in films]
                 yield from joined(runs).figures(f"{family} {change}, {title}")
 
 
@@ -135,9 +136,9 @@ def dim(draws: int) -> Iterator[Number]:
 
 
 def shutters(frames: int) -> Iterator[Number]:
-    line = READ / FRAME[0] / FPS
+    film, line = list(ageing.swaying(3, frames)), READ / FRAME[0] / FPS
     for title, options in (("without", {}), ("line_time", {"line_time": line, "fps": FPS})):
-        run = follow(ageing.swaying(3, frames), **options)
+        run = follow(iter(film), **options)
         yield from Run(*(value[5:] for value in run)).figures(f"rolling shutter, {title}")
 
 
@@ -156,16 +157,16 @@ def show(numbers: list[Number]) -> None:
 @click.command()
 @click.option("--scenes", default=2, show_default=True, help="of each family")
 @click.option("--only", multiple=True, type=click.Choice(["shutter", "dim", "surface", "still"]), help="one part")
-@click.option("--quick", is_flag=True, help="waves only, a twentieth of the frames")
+@click.option("--quick", is_flag=True, help="waves only, and some frames")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
 def main(scenes: int, only: tuple[str, ...], quick: bool, out: Path | None) -> None:
     """Measure all of it."""
     torch.set_num_threads(1)
     families = ("waves",) if quick else ("waves", "pads", "speckle")
     parts = {
-        "shutter": partial(shutters, 15 if quick else 60),
+        "shutter": partial(shutters, 10 if quick else 60),
         "dim": partial(dim, 2 if quick else 40),
-        "surface": partial(surfaces, 20 if quick else ageing.LIFE, 1 if quick else scenes, families),
+        "surface": partial(surfaces, 12 if quick else ageing.LIFE, 1 if quick else scenes, families),
         "still": partial(drifts, 60 if quick else 10_000),
     }
     numbers = [number for name in only or parts for number in parts[name]()]

@@ -149,6 +149,8 @@ CALLS = {
     "Calibration": (lambda: te.calibrate(MOVES, STAGE), converted),
 }
 QUICK = [name for name in CALLS if name not in {"Tracker, native", "Tracker, torch", "servo.find"}]
+FEW = {"float16 autocast", "float64 default", "all at once"}  # what is at once with others, only with them
+cases = pytest.mark.parametrize(("name", "state"), [(n, s) for n in CALLS for s in STATES if n in QUICK or s in FEW])
 
 
 @cache
@@ -190,8 +192,7 @@ def _plain() -> Iterator[None]:
     assert torch.zeros(1).device.type == "cpu"
 
 
-@pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("name", CALLS)
+@cases
 def test_what_was_made_before_a_state_serves_in_it_and_afterwards(name: str, state: str) -> None:
     """Plainly made, used under the state, and plainly again."""
     (make, use), (first, second) = CALLS[name], expected(name)
@@ -202,8 +203,7 @@ def test_what_was_made_before_a_state_serves_in_it_and_afterwards(name: str, sta
     assert_same(use(made), second)
 
 
-@pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("name", CALLS)
+@cases
 def test_what_is_made_in_a_state_serves_in_it_and_afterwards(name: str, state: str) -> None:
     """Made and used under the state, which also fills the caches, and then plainly."""
     (make, use), (first, second) = CALLS[name], expected(name)

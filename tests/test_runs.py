@@ -71,7 +71,7 @@ def assert_same(found: Path, wanted: Path) -> None:
     assert summaries[0]["complete"]
     assert len({json.dumps(each["per_template"]) for each in summaries}) == 1
     assert {path.name for path in found.iterdir()} == {path.name for path in wanted.iterdir()}
-    assert [len(list(open_frames(folder / "overlay.mp4"))) for folder in (found, wanted)] == [FRAMES, FRAMES]
+    assert [len(list(open_frames(folder / "overlay.mp4"))) for folder in (found, wanted)] == 2 * [len(a["score"])]
 
 
 def dying(video: Path, out: Path, how: str) -> subprocess.Popen[str]:
@@ -148,14 +148,14 @@ def test_stopped_twice_and_resumed(video, whole, tmp_path):
 @undrawn
 def test_marks_of_the_camera_are_resumed(video, tmp_path):
     """Those that were found before, and which templates they concern."""
-    stack = np.load(video)
+    stack = np.load(video)[:18]
     stack[:, :, 64:68] = 20
     np.save(tmp_path / "striped.npy", stack)
     striped, out = tmp_path / "striped.npy", tmp_path / "stopped"
     session = Session(job(striped, tmp_path / "whole"))
     session.run()
     assert session.tracker.heed.any()
-    stop_at(striped, out, 40)
+    stop_at(striped, out, 10)
     assert (out / "track.changes.part").is_file()
     Session(job(striped, out, resume=True)).run()
     assert_same(out, tmp_path / "whole")
