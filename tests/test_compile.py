@@ -1,7 +1,7 @@
 """torch.compile and torch.export take the page as one graph, without a break, and their poses are those of the page.
 
 The graphs are run without a code generator: what they hold is the matter here (``benchmarks/accelerator.py`` times the
-generated code). The loop's alone goes as far as its operators without side effects, which a generator is given.
+generated code).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def test_align_is_one_graph(blindly, monkeypatch):
     monkeypatch.setattr(robust, "FEW_ROUNDS", 1)
     templates, images, start = problem(0)
     reference, options = te.prepare(templates), FEW | {"max_iterations": 1}
-    compiled = torch.compile(te.align, backend="eager", fullgraph=True, dynamic=False)
+    compiled = torch.compile(te.align, backend="aot_eager", fullgraph=True, dynamic=False)
     came = compiled(reference, images, start, **options)
     _, others, begin = problem(3)
     again = compiled(reference, others, begin, **options)

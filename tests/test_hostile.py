@@ -25,6 +25,7 @@ from torch_ecc.paper.bound import cramer_rao
 from torch_ecc.sim import PlaneWaves
 
 SHORT = eq11(frames(12))
+PLACED, FRAME = eq11(frames(), (160.0, 120.0)), (1, 240, 320)
 
 
 @pytest.fixture(scope="module")
@@ -145,3 +146,21 @@ def test_where_it_was_last_it_has_stayed_or_it_is_not_there() -> None:
     which a lost template is tried, has found another one."""
     run = soak.Soak.of("pads", 21, (0, 150), 61).run()[0][0]
     assert not bool((run.wrong & run.believed).any())
+
+
+def test_what_was_lost_is_believed_only_where_it_looks_like_itself() -> None:
+    """In the dark it has gone on 8 px to where it is not looked for first; least squares slides to another place."""
+    shot = Shot(SCENES["micrograph"](41), 41, PLACED[:28], 61, (240, 320))
+    run = honesty.follow(shot.film(torch.cat((shot.clean[:15], torch.zeros(9, *FRAME), shot.clean[24:]))))
+    assert bool((run.believed & ~run.off)[:14].all())
+    assert not bool((run.believed & run.off)[23:].any())
+    assert bool(run.believed[-1].all())
+
+
+@pytest.mark.parametrize("seed", [2, 4, 6])
+def test_sigma_of_a_small_patch_covers_a_wide_blur(seed: int) -> None:
+    """Which pulls this way and that within the patch: seen in the residuals, not in what they do to the pose."""
+    shot = Shot(SCENES["micrograph"](seed), seed, PLACED[:8], 61, (240, 320))
+    run = honesty.follow(shot.film(torch.cat((shot.clean[:2], shot.taken(blur_sigma=5.0)[2:]))))
+    assert int(run.believed[1:].sum()) >= 2
+    assert not bool((run.believed & run.wrong).any())

@@ -78,8 +78,8 @@ def rolling(shot: Shot) -> Film:
 
 
 def interlaced(shot: Shot) -> Film:
-    """Odd rows are exposed half a frame after the even ones; the pose is the mean of both, which is not that of the time
-    in between: what speeds up by 0.5 px a frame is 0.016 px off it."""
+    """Odd rows are exposed half a frame after the even ones; the pose is the mean of both, which is not that of the
+    time in between: what speeds up by 0.5 px a frame is 0.016 px off it."""
     time = frames(len(shot.path))
     even, odd = eq11(time - 0.25), eq11(time + 0.25)
     image = shot.moved(even).clean

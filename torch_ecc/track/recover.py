@@ -95,7 +95,7 @@ def disbelieved(
     estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, reference: Reference, frame: Tensor
 ) -> Estimate:
     """The ``estimate`` in a ``frame`` (..., H, W) in which those that are still suspect are lost if they have slid away
-    from where they were expected, or hardly look like themselves and are not in sight as a whole or were lost before."""
+    from where they were expected, or hardly look like themselves and have been lost or are not in sight as a whole."""
     index = (torch.tensor(suspects, device=start.device) & Status.good(estimate.status)).nonzero()[:, 0]
     if len(index) == 0:
         return estimate
