@@ -53,6 +53,17 @@ SMALLEST = 5  # px: side of the smallest template
 Fields = TypeVar("Fields", bound=tuple[object, ...])
 
 
+def kept(make: Callable[[Reference], Fields]) -> cached_property[Fields]:
+    """What they ``make`` of a reference, once for as long as that lives; of ``copies`` it is that of the one."""
+
+    def made(reference: Reference) -> Fields:
+        one = reference.one
+        return make(reference) if one is None else copied(once.__get__(one), len(reference.K))
+
+    once = cached_property(lasting(made))
+    return once
+
+
 class Sight(NamedTuple):
     """Where a camera has ``shown`` (H, W) the scene, not a mark of its own; ``clear`` (H, W), where none bears on a
     block of pixels, ``well_clear`` (H, W), nor a little off; the blocks' ``middles`` (3, blocks). See ``sight``."""
@@ -133,30 +144,20 @@ class Reference(_Groups):
         """What the verdict on them needs, by sampler: see ``verdict.known``."""
         return {}
 
-    @cached_property
-    @lasting
-    def _kept_blocks(self) -> Blocks:
-        return blocks_of(self)
+    @property
+    def one(self) -> Reference | None:
+        """The template that these are ``copies`` of."""
+        return self.__dict__.get("_one")
 
-    @cached_property
-    @lasting
-    def _kept_parts(self) -> Parts:
-        return parts_of(self)
-
-    @cached_property
-    @lasting
-    def _kept_strains(self) -> Strains:
-        return strains_of(self.parts, self.normal)
-
-    @cached_property
-    @lasting
-    def _kept_leverage(self) -> Leverage:
-        return leverage_of(self.blocks, self.parts, self.normal)
+    _kept_blocks = kept(blocks_of)
+    _kept_parts = kept(parts_of)
+    _kept_strains = kept(lambda reference: strains_of(reference.parts, reference.normal))
+    _kept_leverage = kept(lambda reference: leverage_of(reference.blocks, reference.parts, reference.normal))
 
     @cached_property
     @lasting
     def _kept_patch(self) -> Tensor:
-        return patch_of(self)
+        return patch_of(self) if self.one is None else self.one.patch.expand(len(self.K))
 
     @cached_property
     @lasting
@@ -164,7 +165,7 @@ class Reference(_Groups):
         """The templates in 16 bits, for a compiled engine: made once for as long as the reference lives."""
         from torch_ecc.core.native.packed import pack  # which needs to know what a reference is
 
-        return pack(self)
+        return pack(self) if self.one is None else self.one.packed.copies(len(self.K))
 
     def warps(self, pose: Tensor) -> Tensor:
         """2x3 warps (B, 2, 3) that take the grid's pixels to the frame at poses (B, 3): eq. (2) about the centre."""
@@ -192,6 +193,14 @@ class Reference(_Groups):
             return self
         return each(lambda v: v[index], self)
 
+    def copies(self, count: int) -> Reference:
+        """One template (B = 1) so many times, in the same memory; what is made once is made of the one."""
+        if count == 1:
+            return self
+        many = copied(self, count)
+        many.__dict__["_one"] = self
+        return many
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
         """``function`` applied to every tensor, ``lambda t: t.to(device)`` for instance."""
         return each(function, self, shared=True)
@@ -212,6 +221,11 @@ def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared
             values.append(value)
     make: Callable[..., Fields] = type(first)
     return make(*values)
+
+
+def copied(one: Fields, count: int) -> Fields:
+    """So many times the tensors (1, ...) of a record, without copies."""
+    return each(lambda value: value.expand(count, *value.shape[1:]), one)
 
 
 def chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:

@@ -76,7 +76,7 @@ def _frames(values: Tensor, degree: int, size: torch.Size) -> Frames:
 
 
 def _grids(packed: Packed, k: int) -> Grids:
-    planes, weight, numbers = packed.tensors[3 * k : 3 * k + 3]
+    planes, weight, numbers = (tensor.contiguous() for tensor in packed.tensors[3 * k : 3 * k + 3])
     _, _, height, pitch = planes.shape
     even = weight.shape[:2] == (1, 1)
     return Grids(planes, weight, numbers, *_fixed(height, packed.widths[k], pitch, packed.steps[k], even))
