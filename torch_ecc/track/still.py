@@ -12,8 +12,9 @@ mark unless the template fits without it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -50,6 +51,8 @@ CLEARLY = 3.0  # times as much must be left with the marks
 UNSEEN = 1.0  # px: what holds it back by more has been told before, as a mark
 ROUNDS = 4  # in which they are told from poses that they bend less and less
 
+Made = TypeVar("Made")
+
 
 class Look(NamedTuple):
     """Pixels (h, w) of a frame from ``corner`` (y, x) on, around one template. Variances over AROUND px: how much has
@@ -85,6 +88,13 @@ class Look(NamedTuple):
 def look(still: Still, pose: Tensor, clean: Reference, *, through_coder: bool = True) -> Look:
     """At one template at a ``pose`` (1, 3), which is ``clean`` of marks as far as one knows; a coder may leave more
     noise than the template shows."""
+    contrast = clean.normal.energy / clean.normal.total
+    name = "look" if through_coder else "look without a coder"
+    return still.once(name, lambda: looked(still, pose, float(contrast), through_coder), pose, contrast)
+
+
+def looked(still: Still, pose: Tensor, contrast: float, through_coder: bool) -> Look:
+    """That of a template with a ``contrast``."""
     reference, (height, width) = still.reference, still.shown.shape
     warps = reference.warps(torch.cat((pose, still.home)))
     x, y = (warps @ reference.grid.box.to(warps.dtype)).round().long().unbind(1)
@@ -97,7 +107,6 @@ def look(still: Still, pose: Tensor, clean: Reference, *, through_coder: bool = 
     known &= still.shown[y0:y1, x0:x1]
     left = unexplained(view[None], torch.where(known, expected, torch.nan)[None], expected[None])[0]
     left = mean(torch.where(known, left, 0.0).square())
-    contrast = float(clean.normal.energy / clean.normal.total)
     noise = 2 * max(float(reference.noise.of_frame), LEAST_NOISE**2 * contrast)
     if through_coder and bool(known.any()):
         noise = coded(noise, left[known], variance(expected)[known], MOST_NOISE * contrast)
@@ -218,7 +227,8 @@ class Trial(NamedTuple):
 class Still(NamedTuple):
     """One template in one ``image`` (1, 1, H, W), expected at ``start`` (1, 3) after it was at ``home`` (1, 3) in the
     ``first`` one (H, W), known as so many standard deviations about a mean, its ``level`` (2,); where the camera has
-    ``shown`` (H, W) the scene, as far as one knows; ``pure``: it has been seen elsewhere as it is, so no mark is in it.
+    ``shown`` (H, W) the scene, as far as one knows; ``pure``: it has been seen elsewhere as it is, so no mark is in it;
+    what has been ``made`` of it.
     """
 
     reference: Reference
@@ -230,6 +240,17 @@ class Still(NamedTuple):
     shown: Tensor
     pure: bool
     settings: Settings
+    made: list[tuple[str, tuple[Tensor, ...], Any]]
+
+    def once(self, name: str, make: Callable[[], Made], *given: Tensor) -> Made:
+        """What is to be made of tensors that are ``given``, as it was made of the same ones: what a mark seems to be
+        mostly leads to the same pose again, and that to the same mark."""
+        for other, those, made in self.made:
+            if other == name and all(map(torch.equal, those, given)):
+                return made  # type: ignore[no-any-return]
+        new = make()
+        self.made.append((name, given, new))
+        return new
 
     def disagreement(self) -> Tensor | None:
         """By what (1, 3) least squares may be off if the blocks that fix it are wrong, None if all say the same."""
@@ -240,7 +261,11 @@ class Still(NamedTuple):
 
     def trial(self, shown: Tensor) -> Trial | None:
         """With less that is ``shown``; None if hardly anything is left of it."""
-        reference = behind(self.reference, self.home, ~shown, torch.ones_like(self.home[:, 0], dtype=torch.bool))
+        return self.once("trial", lambda: self._tried(shown), self.start, shown)
+
+    def _tried(self, shown: Tensor) -> Trial | None:
+        which = torch.ones_like(self.home[:, 0], dtype=torch.bool)
+        reference = self.once("behind", lambda: behind(self.reference, self.home, ~shown, which), shown)
         if not bool(reference.normal.total > LEAST):
             return None
         memory = Memory.none(reference)
