@@ -57,8 +57,7 @@ def kept(make: Callable[[Reference], Fields]) -> cached_property[Fields]:
     """What they ``make`` of a reference, once for as long as that lives; of ``copies`` it is that of the one."""
 
     def made(reference: Reference) -> Fields:
-        one = reference.one
-        return make(reference) if one is None else copied(once.__get__(one), len(reference.K))
+        return copied(once.__get__(reference.one), len(reference.K)) if reference.one else make(reference)
 
     once = cached_property(lasting(made))
     return once
@@ -176,14 +175,19 @@ class Reference(_Groups):
 
     def distorted(self, distortion: Tensor | None) -> Reference:
         """The same templates, seen with another ``distortion`` (B, 2, 2)."""
-        coarse = None if self.coarse is None else self.coarse.distorted(distortion)
-        other = self._replace(coarse=coarse, distortion=distortion)
-        other.__dict__ = self.__dict__  # what is made once depends on no distortion
-        return other
+        return self._alike(coarse=self.coarse and self.coarse.distorted(distortion), distortion=distortion)
+
+    def through(self, sight: Sight | None, heed: Tensor | None = None) -> Reference:
+        """The same templates, through another camera."""
+        return self._alike(sight=sight, heed=heed)
 
     def judged_by(self, normal: Normal) -> Reference:
         """The same templates with ``normal`` equations that have the same numbers, and gradients."""
-        other = self._replace(normal=normal)
+        return self._alike(normal=normal)
+
+    def _alike(self, **changes: object) -> Reference:
+        """With ``changes`` that nothing that is made once depends on."""
+        other: Reference = self._replace(**changes)  # type: ignore[arg-type]
         other.__dict__ = self.__dict__
         return other
 

@@ -172,7 +172,11 @@ def images(reference: Reference) -> tuple[Tensor, Tensor]:
 
 def mean(image: Tensor) -> Tensor:
     """Over squares of AROUND px, (h, w)."""
-    return F.avg_pool2d(image[None, None], AROUND, 1, AROUND // 2, count_include_pad=False)[0, 0]
+    both = torch.stack((image, torch.ones_like(image)))
+    for axis in (1, 2):
+        n, wide = both.shape[axis], F.pad(both, (0, 0, AROUND // 2, AROUND // 2) if axis == 1 else (AROUND // 2,) * 2)
+        both = sum((wide.narrow(axis, k, n) for k in range(1, AROUND)), wide.narrow(axis, 0, n))
+    return both[0] / both[1]
 
 
 def variance(image: Tensor) -> Tensor:
@@ -191,13 +195,13 @@ def behind(reference: Reference, home: Tensor, marks: Tensor, which: Tensor) -> 
     def without(part: Reference) -> Reference:
         return reweigh(part, picked(clear, part.warps(home[index]), part.grid.pixels))
 
-    some = reference._replace(sight=None, heed=None).select(index)
+    some = reference.through(None).select(index)
     coarse = None if some.coarse is None else without(some.coarse)
     some = without(some)
     level = noise_level(*images(some)).maximum(some.noise.level)  # dark marks have less of it
     some = some._replace(coarse=coarse, noise=some.noise._replace(level=level, power=level.to(home).square()))
     if len(index) < len(which):
-        whole = reference._replace(sight=None, heed=None)
+        whole = reference.through(None)
         some = each(lambda old, new: old.index_copy(0, index, new), whole, some)
     return seen_through(some, shown, None if len(index) == len(which) else which)
 
