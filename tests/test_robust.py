@@ -243,21 +243,3 @@ def test_where_all_that_tells_the_pose_is_covered_the_flat_rest_is_not_enough():
     stack = noisy(torch.stack((ground + mark, ground, ground)), 1.0)
     track = Tracker(stack[0], [MIDDLE], SIZE, search=False).track_sequence(stack[1:])
     assert (track.status == Status.LOST).all()
-
-
-def test_what_has_strayed_is_not_followed():
-    """A target that has leapt is for a search to find: rounds that have gone far from where it was are at an end."""
-    frames, poses = shots("waves")
-    first, view = noisy(covered(frames, 0.3, "texture"))[:2, None, None].float()
-    x, y = (round(v - SIZE / 2) for v in MIDDLE)
-    reference, settings, made = prepare(first[..., y : y + SIZE, x : x + SIZE]), Settings(), []
-    engine = engine_for(reference, view, settings)
-
-    def running(reference, image, start, how, trust):
-        found = engine(reference, image, start, how, trust)
-        made.append(found.pose + torch.tensor([30.0 * len(made), 0, 0]) * (how.max_iterations > 1))
-        return found._replace(pose=made[-1])
-
-    found = solve(running, reference, view, poses[:1], settings)
-    assert len(made) == 1 + 3 + 2  # least squares, trials of one round each, looks before two of them
-    assert torch.equal(found.pose, made[0])

@@ -41,8 +41,7 @@ WORST = 1e30  # excess of what does not fit at all
 FITS = 1.4  # median excess: nothing else is tried
 BRIGHTER = 2.0  # times the gain of least squares
 RECOGNISED = 0.9  # of the usual score: least squares that reaches it has found the template
-FARTHEST = 8.0  # px, of the farthest pixel: what is seen in part has not moved more,
-STRAYED = 2.0  # nor does what has once been so many times as far come back
+FARTHEST = 8.0  # px, of the farthest pixel: what is seen in part has not moved more
 SETTLED = 0.01  # of the template's weight: trust changes no more
 
 
@@ -189,7 +188,7 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
     better, no other is made; where it has not, one that recognises most of the template fits."""
     strange = ~recognised
     there = start.index_copy(0, doubted.which, plain.pose)
-    here = start[doubted.which]
+    here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
     usual = usual_scale(doubted, plain.gain, SLIP)
     first = usual, trust(compared(doubted, variance, seen, any_scale(doubted))[1])
@@ -202,13 +201,13 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
     if remembered:
         trials.insert(0, (start, (usual, doubted.last)))
     for place, begin in trials if is_cpu(start.device) else trials[:1]:  # elsewhere all templates would go through all
-        found, near = reweighted(doubted, place, here, *(begin or median_look(doubted, place)))
+        found = reweighted(doubted, place, *(begin or median_look(doubted, place)))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
         well |= strange & recognises_most(doubted, found)
         total = (price * share).sum(1)
         better = torch.where(well == fits, total < least, well)  # what fits most of it, or else what leaves less
         better = torch.where(recognised, (well >= fits) & improves(left, price, share), better)
-        better &= near
+        better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
         best, recognised = chosen(better, found, best), recognised & ~better
         if remembered:  # a cover mostly stays: what has led here in the last frame, and does so again, is enough
             recognised, remembered = recognised | better & covers_most(found), False
@@ -249,24 +248,21 @@ def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:
     return scale, trust(ratio)
 
 
-def reweighted(doubted: Doubted, place: Tensor, here: Tensor, scale: Scale, after: Tensor) -> tuple[Solution, Tensor]:
+def reweighted(doubted: Doubted, place: Tensor, scale: Scale, after: Tensor) -> Solution:
     """Solved from their ``place`` (B, 3) on, with trust that begins as ``after`` (n, blocks) a look of that ``scale``
-    and settles; and whether that is near ``here`` (n, 3), and has been all the way (n,)."""
-    blocks, lever = doubted.blocks, doubted.reference.place.lever[doubted.which]
-    never = torch.zeros_like(here[:, 0], dtype=torch.bool)
+    and settles."""
+    blocks = doubted.blocks
     for _ in range(ROUNDS if is_cpu(place.device) else FEW_ROUNDS):
         before = after
         found = doubted.solve(place, doubted.settings, before)
-        distance = torch.linalg.vector_norm((found.pose - here) * lever, dim=1)
-        never = never | (distance > STRAYED * FARTHEST)
         most = Scale(scale.noise, scale.slip.clamp(max=SLIP))  # no cover may talk itself in
         scale, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
         after = trust(ratio)
         change = ((after - before).abs() * blocks.weight).sum(1)
-        if is_cpu(place.device) and bool((never | (change <= SETTLED * blocks.weight.sum(1))).all()):
+        if is_cpu(place.device) and bool((change <= SETTLED * blocks.weight.sum(1)).all()):
             break
         place = place.index_copy(0, doubted.which, found.pose)
-    return found._replace(trust=before), (distance < FARTHEST) & ~never
+    return found._replace(trust=before)
 
 
 def any_scale(doubted: Doubted) -> Scale:
