@@ -6,16 +6,19 @@ import math
 
 import pytest
 import torch
+from engines import compiled
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torch_ecc import ECC, SSD, PaperECC, prepare
+from torch_ecc.core.align import solve
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.filters import blur
 from torch_ecc.core.noise import INSTRUMENT_BLUR, NOISE_RESPONSE
 from torch_ecc.core.pose import transform
 from torch_ecc.core.reference import reweigh
 from torch_ecc.core.sampling import gradients
+from torch_ecc.core.settings import Settings
 from torch_ecc.sim.scene.scene import PlaneWaves
 
 SCENE = PlaneWaves.random(seed=3)
@@ -269,3 +272,20 @@ def test_the_response_of_gradients_to_noise_is_that_to_an_impulse(width):
     assert (float((raw * blurred).sum()), float(blurred.square().sum())) == pytest.approx(
         NOISE_RESPONSE[width], rel=1e-5
     )
+
+
+@pytest.mark.parametrize("backend", ["torch", pytest.param("native", marks=compiled)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_copies_are_the_template_so_many_times(backend, masked):
+    """In its memory, and with the same answers as templates of their own."""
+    h, w = 71, 64
+    mask = (grid(h, w).norm(dim=-1) < 30).view(h, w) if masked else None
+    reference = prepare(analytic_template(h, w), mask=mask)
+    copies, own = reference.copies(3), reference.select(torch.zeros(3, dtype=torch.int64))
+    assert copies.K.data_ptr() == reference.K.data_ptr()
+    image = SCENE.value(grid(140, 150)).reshape(1, 1, 140, 150).float()
+    start = torch.tensor([[74.5, 69.5, 0.0], [75.6, 69.0, 0.02], [20.0, 30.0, 1.0]]).double()  # a part is out
+    settings = Settings(backend=backend)
+    for a, b in zip(solve(copies, image, start, settings), solve(own, image, start, settings), strict=True):
+        assert torch.allclose(a, b, rtol=1e-4, atol=1e-6, equal_nan=True)
+    assert reference.copies(1) is reference

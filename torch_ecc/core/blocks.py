@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.criteria import centred
-from torch_ecc.core.grid import BLOCK
+from torch_ecc.core.grid import BLOCK, Grid
 
 if TYPE_CHECKING:
     from torch_ecc.core.reference import Reference
@@ -86,11 +86,17 @@ def parts_of(reference: Reference) -> Parts:
     place = (grid.pixels[:2] - reference.place.centre[:, :, None]) / reference.place.radius[:, None, None]
     gx, gy, x, y = (v.to(R.dtype) for v in (*columns.signal[:, :2].unbind(1), *place.unbind(1)))
     moved = [shape(x, y) for shape, _ in STRAINS]
-    both, (b, p) = torch.cat((R, torch.stack([gx * dx + gy * dy for dx, dy in moved], 1)), 1), R.shape[:2]
-    sums = R.new_zeros(b, p, both.shape[1], grid.blocks[0] * grid.blocks[1])
-    for k in range(p):
-        sums[:, k].index_add_(2, grid.block, both * (Z[:, k] * columns.weight)[:, None])
+    both, p = torch.cat((R, torch.stack([gx * dx + gy * dy for dx, dy in moved], 1)), 1), R.shape[1]
+    sums = torch.einsum("bpnk,bqnk->bpqn", *(tiled(rows, grid) for rows in (Z * columns.weight[:, None], both)))
     return Parts(sums[:, :, :p], sums[:, :, p:], reference.blocks.weight, reference.place.radius)
+
+
+def tiled(rows: Tensor, grid: Grid) -> Tensor:
+    """``rows`` (B, p, N) of a grid's pixels, block by block: (B, p, blocks, BLOCK^2), 0 where there is none."""
+    column, row = (grid.pixels[:2] - grid.box[:2, :1]).round().long() % BLOCK
+    tiles = rows.new_zeros(*rows.shape[:2], grid.blocks[0] * grid.blocks[1], BLOCK**2)
+    tiles.flatten(2).index_copy_(2, (grid.block * BLOCK + row) * BLOCK + column, rows)
+    return tiles
 
 
 def patch_of(reference: Reference) -> Tensor:

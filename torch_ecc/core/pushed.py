@@ -121,4 +121,4 @@ def trusted(found: Solution, asked: Tensor) -> Trust | None:
     """As it was solved with, in those that are ``asked`` (B,)."""
     if found.trust is None and is_cpu(asked.device):
         return None
-    return Trust(torch.arange(len(asked), device=asked.device), found.trust, asked)
+    return Trust(torch.arange(len(asked), device=asked.device), found.trust, asked, judged=False)

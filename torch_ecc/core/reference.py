@@ -53,6 +53,16 @@ SMALLEST = 5  # px: side of the smallest template
 Fields = TypeVar("Fields", bound=tuple[object, ...])
 
 
+def kept(make: Callable[[Reference], Fields]) -> cached_property[Fields]:
+    """What they ``make`` of a reference, once for as long as that lives; of ``copies`` it is that of the one."""
+
+    def made(reference: Reference) -> Fields:
+        return copied(once.__get__(reference.one), len(reference.K)) if reference.one else make(reference)
+
+    once = cached_property(lasting(made))
+    return once
+
+
 class Sight(NamedTuple):
     """Where a camera has ``shown`` (H, W) the scene, not a mark of its own; ``clear`` (H, W), where none bears on a
     block of pixels, ``well_clear`` (H, W), nor a little off; the blocks' ``middles`` (3, blocks). See ``sight``."""
@@ -133,30 +143,20 @@ class Reference(_Groups):
         """What the verdict on them needs, by sampler: see ``verdict.known``."""
         return {}
 
-    @cached_property
-    @lasting
-    def _kept_blocks(self) -> Blocks:
-        return blocks_of(self)
+    @property
+    def one(self) -> Reference | None:
+        """The template that these are ``copies`` of."""
+        return self.__dict__.get("_one")
 
-    @cached_property
-    @lasting
-    def _kept_parts(self) -> Parts:
-        return parts_of(self)
-
-    @cached_property
-    @lasting
-    def _kept_strains(self) -> Strains:
-        return strains_of(self.parts, self.normal)
-
-    @cached_property
-    @lasting
-    def _kept_leverage(self) -> Leverage:
-        return leverage_of(self.blocks, self.parts, self.normal)
+    _kept_blocks = kept(blocks_of)
+    _kept_parts = kept(parts_of)
+    _kept_strains = kept(lambda reference: strains_of(reference.parts, reference.normal))
+    _kept_leverage = kept(lambda reference: leverage_of(reference.blocks, reference.parts, reference.normal))
 
     @cached_property
     @lasting
     def _kept_patch(self) -> Tensor:
-        return patch_of(self)
+        return patch_of(self) if self.one is None else self.one.patch.expand(len(self.K))
 
     @cached_property
     @lasting
@@ -164,7 +164,7 @@ class Reference(_Groups):
         """The templates in 16 bits, for a compiled engine: made once for as long as the reference lives."""
         from torch_ecc.core.native.packed import pack  # which needs to know what a reference is
 
-        return pack(self)
+        return pack(self) if self.one is None else self.one.packed.copies(len(self.K))
 
     def warps(self, pose: Tensor) -> Tensor:
         """2x3 warps (B, 2, 3) that take the grid's pixels to the frame at poses (B, 3): eq. (2) about the centre."""
@@ -175,14 +175,19 @@ class Reference(_Groups):
 
     def distorted(self, distortion: Tensor | None) -> Reference:
         """The same templates, seen with another ``distortion`` (B, 2, 2)."""
-        coarse = None if self.coarse is None else self.coarse.distorted(distortion)
-        other = self._replace(coarse=coarse, distortion=distortion)
-        other.__dict__ = self.__dict__  # what is made once depends on no distortion
-        return other
+        return self._alike(coarse=self.coarse and self.coarse.distorted(distortion), distortion=distortion)
+
+    def through(self, sight: Sight | None, heed: Tensor | None = None) -> Reference:
+        """The same templates, through another camera."""
+        return self._alike(sight=sight, heed=heed)
 
     def judged_by(self, normal: Normal) -> Reference:
         """The same templates with ``normal`` equations that have the same numbers, and gradients."""
-        other = self._replace(normal=normal)
+        return self._alike(normal=normal)
+
+    def _alike(self, **changes: object) -> Reference:
+        """With ``changes`` that nothing that is made once depends on."""
+        other: Reference = self._replace(**changes)  # type: ignore[arg-type]
         other.__dict__ = self.__dict__
         return other
 
@@ -191,6 +196,14 @@ class Reference(_Groups):
         if isinstance(index, Tensor) and index.tolist() == list(range(len(self.K))):
             return self
         return each(lambda v: v[index], self)
+
+    def copies(self, count: int) -> Reference:
+        """One template (B = 1) so many times, in the same memory; what is made once is made of the one."""
+        if count == 1:
+            return self
+        many = copied(self, count)
+        many.__dict__["_one"] = self
+        return many
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Reference:
         """``function`` applied to every tensor, ``lambda t: t.to(device)`` for instance."""
@@ -212,6 +225,11 @@ def each(function: Callable[..., Tensor], first: Fields, *others: Fields, shared
             values.append(value)
     make: Callable[..., Fields] = type(first)
     return make(*values)
+
+
+def copied(one: Fields, count: int) -> Fields:
+    """So many times the tensors (1, ...) of a record, without copies."""
+    return each(lambda value: value.expand(count, *value.shape[1:]), one)
 
 
 def chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:

@@ -65,13 +65,13 @@ def seen_through(reference: Reference, shown: Tensor | None, heed: Tensor | None
     """The ``reference`` as a camera sees it that shows the scene where ``shown`` (H, W), by default everywhere, to
     those templates that ``heed`` (B,), by default all."""
     if shown is None:
-        return reference._replace(sight=None, heed=None)
+        return reference.through(None)
     grid = reference.grid
     row, column = (torch.arange(n, device=grid.box.device) * BLOCK + (BLOCK - 1) / 2 for n in grid.blocks)
     y, x = torch.meshgrid(row + grid.box[1, 0], column + grid.box[0, 0], indexing="ij")
     middles = torch.stack((x.flatten(), y.flatten(), torch.ones_like(x.flatten())))
     sight = Sight(shown, eroded(shown, REACH), eroded(shown, REACH + SLACK), middles)
-    return reference._replace(sight=sight, heed=heed)
+    return reference.through(sight, heed)
 
 
 def picked(clear: Tensor, warp: Tensor, points: Tensor) -> Tensor:
@@ -117,8 +117,8 @@ def trusted(which: Tensor, clear: Tensor, trust: Trust | None) -> Trust | None:
     if the host knows that it is whole."""
     if trust is None and is_cpu(clear.device) and bool(clear.all()):
         return None
-    blocks, asked = (None, None) if trust is None else (trust.blocks, trust.asked)
-    return Trust(which, clear.float() if blocks is None else blocks * clear, asked)
+    trust = trust or Trust(which, None)
+    return trust._replace(blocks=clear.float() if trust.blocks is None else trust.blocks * clear)
 
 
 def without(found: Solution, clear: Tensor) -> Solution:

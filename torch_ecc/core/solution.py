@@ -21,11 +21,13 @@ FLAT = 1e-12  # of a patch's power: what is left of it off its mean is rounding
 class Trust(NamedTuple):
     """Of the templates at ``which`` (n,): by how much the pixels of their ``blocks`` (n, blocks) count, 0 to 1, None if
     all do. Where the host does not look that is all of them, in their order; what is answered of those that are not
-    ``asked`` (n,) for, by default all, means nothing."""
+    ``asked`` (n,) for, by default all, means nothing. ``judged``: whether anybody asks for more than poses, sums and
+    totals; else the ``normal`` equations may be those of all pixels."""
 
     which: Tensor
     blocks: Tensor | None
     asked: Tensor | None = None
+    judged: bool = True
 
     @staticmethod
     def whole(trust: Trust | None) -> bool:

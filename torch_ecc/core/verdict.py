@@ -29,7 +29,7 @@ from torch_ecc.core.noise import NOISE_SHARE
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.pose import turn
 from torch_ecc.core.pushed import Push
-from torch_ecc.core.reference import Reference
+from torch_ecc.core.reference import Reference, copied
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution
@@ -65,20 +65,27 @@ VERDICTS = (
 )
 
 
+class Instruments(NamedTuple):
+    """Of B templates: which have so much ``noise`` (B,) bool that it matters where it is, and by how much blocks count
+    there, ``weight`` (B, blocks, 1), see ``unevenness``."""
+
+    noisy: Tensor
+    weight: Tensor
+
+
 class Known(NamedTuple):
     """What the verdict on B templates needs, the same in every frame: ``free`` and ``template_free`` (B,), the degrees
     of freedom of what a residual's square sum is made of, frame and template; ``per_frame`` (B,), one over how many
     frames a template is the mean of; ``clusters`` (B, 9), see ``clinging.scale_of``, None if there are too few blocks;
-    ``share`` (B,), ``noise_share`` of a variance of 1; ``instruments``, of which there is noise enough for it to matter
-    where it is, (B,) bool, and by how much blocks count there, see ``unevenness``, None if of none; ``sandwich``, see
-    there."""
+    ``share`` (B,), ``noise_share`` of a variance of 1; ``instruments``, None if noise matters in none;
+    ``sandwich``, see there."""
 
     free: Tensor
     template_free: Tensor
     per_frame: Tensor
     clusters: Tensor | None
     share: Tensor
-    instruments: tuple[Tensor, Tensor] | None
+    instruments: Instruments | None
     sandwich: Sandwich
 
 
@@ -96,14 +103,14 @@ def known_of(reference: Reference, normal: Normal, interpolation: str) -> Known:
     )
 
 
-def instruments(reference: Reference, normal: Normal) -> tuple[Tensor, Tensor] | None:
+def instruments(reference: Reference, normal: Normal) -> Instruments | None:
     """See ``Known``."""
     noisy = normal.noise_share * reference.noise.power > LITTLE_NOISE
     if is_cpu(noisy.device) and not bool(noisy.any()):
         return None
     weight, wiener = reference.blocks.weight, reference.blocks.wiener
     mean = (wiener * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
-    return noisy, (wiener / mean.clamp(min=LEAST))[:, :, None]
+    return Instruments(noisy, (wiener / mean.clamp(min=LEAST))[:, :, None])
 
 
 def known(reference: Reference, normal: Normal, interpolation: str) -> Known:
@@ -111,7 +118,10 @@ def known(reference: Reference, normal: Normal, interpolation: str) -> Known:
     if normal is not reference.normal or normal.bread.requires_grad or torch.compiler.is_compiling():
         return known_of(reference, normal, interpolation)
     kept = reference.verdicts
-    if interpolation not in kept:
+    if interpolation not in kept and reference.one is not None:
+        one = known(reference.one, reference.one.normal, interpolation)
+        kept[interpolation] = copied(one, len(reference.K))
+    elif interpolation not in kept:
         kept[interpolation] = lasting(known_of)(reference, normal, interpolation)
     return kept[interpolation]
 

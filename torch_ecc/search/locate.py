@@ -183,14 +183,15 @@ class Locator:
 
     def refined(self, image: Tensor, b: int, pose: Tensor) -> tuple[Estimate, Tensor]:
         """Template ``b`` aligned with ``image`` (1, 1, H, W) from poses (K, 3): estimate and score."""
-        copies = _copies(self.pyramids[b][0], len(pose))
+        reference = self.pyramids[b][0]
+        copies = reference.copies(len(pose))
         estimate = solve(copies, image, pose, self.settings)
         for _ in range(MAX_RESTARTS):  # where the texture lets a pose slide, iterations are spent on the way
             distance = pose_distance(estimate.displacement, torch.zeros_like(pose), radius=copies.place.radius)
             far = (distance > RESTART_DISTANCE).nonzero()[:, 0]
             if len(far) == 0:
                 break
-            again = solve(_copies(copies, len(far)), image, estimate.pose[far], self.settings)
+            again = solve(reference.copies(len(far)), image, estimate.pose[far], self.settings)
             estimate = estimate.put(far, again)
         estimate = estimate._replace(origin=torch.full_like(estimate.origin, int(Origin.ANYWHERE)))
         return estimate, detrended_zncc_at(copies, image, estimate.pose)
@@ -225,7 +226,7 @@ def image_pyramid(image: Tensor, levels: int) -> list[Tensor]:
 
 def aligned(reference: Reference, image: Tensor, pose: Tensor) -> Tensor:
     """Candidates (K, 3) of one template aligned with one level: the SURVIVORS of them, best first."""
-    copies = _copies(reference, len(pose))
+    copies = reference.copies(len(pose))
     there = engine_for(copies, image, COARSE)(copies, image, pose, COARSE, None).pose
     before, after = detrended_zncc_at(copies, image, pose), detrended_zncc_at(copies, image, there)
     pose, score = torch.where((after > before)[:, None], there, pose), torch.maximum(before, after)
@@ -302,10 +303,6 @@ def ranked(found: tuple[Estimate, Tensor], *, radius: Tensor, near: Tensor | Non
         distance = torch.where(within_margin(score[order], score[order[0]]), distance, torch.inf)
         order = order[distance.argsort(stable=True)]
     return estimate.at(order), score[order]
-
-
-def _copies(reference: Reference, count: int) -> Reference:
-    return reference.select(torch.zeros(count, dtype=torch.int64, device=reference.place.radius.device))
 
 
 def _best_two(found: list[tuple[Estimate, Tensor]]) -> Located:

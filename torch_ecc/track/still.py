@@ -12,8 +12,9 @@ mark unless the template fits without it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -50,6 +51,8 @@ CLEARLY = 3.0  # times as much must be left with the marks
 UNSEEN = 1.0  # px: what holds it back by more has been told before, as a mark
 ROUNDS = 4  # in which they are told from poses that they bend less and less
 
+Made = TypeVar("Made")
+
 
 class Look(NamedTuple):
     """Pixels (h, w) of a frame from ``corner`` (y, x) on, around one template. Variances over AROUND px: how much has
@@ -85,6 +88,13 @@ class Look(NamedTuple):
 def look(still: Still, pose: Tensor, clean: Reference, *, through_coder: bool = True) -> Look:
     """At one template at a ``pose`` (1, 3), which is ``clean`` of marks as far as one knows; a coder may leave more
     noise than the template shows."""
+    contrast = clean.normal.energy / clean.normal.total
+    name = "look" if through_coder else "look without a coder"
+    return still.once(name, lambda: looked(still, pose, float(contrast), through_coder), pose, contrast)
+
+
+def looked(still: Still, pose: Tensor, contrast: float, through_coder: bool) -> Look:
+    """That of a template with a ``contrast``."""
     reference, (height, width) = still.reference, still.shown.shape
     warps = reference.warps(torch.cat((pose, still.home)))
     x, y = (warps @ reference.grid.box.to(warps.dtype)).round().long().unbind(1)
@@ -97,7 +107,6 @@ def look(still: Still, pose: Tensor, clean: Reference, *, through_coder: bool = 
     known &= still.shown[y0:y1, x0:x1]
     left = unexplained(view[None], torch.where(known, expected, torch.nan)[None], expected[None])[0]
     left = mean(torch.where(known, left, 0.0).square())
-    contrast = float(clean.normal.energy / clean.normal.total)
     noise = 2 * max(float(reference.noise.of_frame), LEAST_NOISE**2 * contrast)
     if through_coder and bool(known.any()):
         noise = coded(noise, left[known], variance(expected)[known], MOST_NOISE * contrast)
@@ -163,7 +172,11 @@ def images(reference: Reference) -> tuple[Tensor, Tensor]:
 
 def mean(image: Tensor) -> Tensor:
     """Over squares of AROUND px, (h, w)."""
-    return F.avg_pool2d(image[None, None], AROUND, 1, AROUND // 2, count_include_pad=False)[0, 0]
+    both = torch.stack((image, torch.ones_like(image)))
+    for axis in (1, 2):
+        n, wide = both.shape[axis], F.pad(both, (0, 0, AROUND // 2, AROUND // 2) if axis == 1 else (AROUND // 2,) * 2)
+        both = sum((wide.narrow(axis, k, n) for k in range(1, AROUND)), wide.narrow(axis, 0, n))
+    return both[0] / both[1]
 
 
 def variance(image: Tensor) -> Tensor:
@@ -182,13 +195,13 @@ def behind(reference: Reference, home: Tensor, marks: Tensor, which: Tensor) -> 
     def without(part: Reference) -> Reference:
         return reweigh(part, picked(clear, part.warps(home[index]), part.grid.pixels))
 
-    some = reference._replace(sight=None, heed=None).select(index)
+    some = reference.through(None).select(index)
     coarse = None if some.coarse is None else without(some.coarse)
     some = without(some)
     level = noise_level(*images(some)).maximum(some.noise.level)  # dark marks have less of it
     some = some._replace(coarse=coarse, noise=some.noise._replace(level=level, power=level.to(home).square()))
     if len(index) < len(which):
-        whole = reference._replace(sight=None, heed=None)
+        whole = reference.through(None)
         some = each(lambda old, new: old.index_copy(0, index, new), whole, some)
     return seen_through(some, shown, None if len(index) == len(which) else which)
 
@@ -218,7 +231,8 @@ class Trial(NamedTuple):
 class Still(NamedTuple):
     """One template in one ``image`` (1, 1, H, W), expected at ``start`` (1, 3) after it was at ``home`` (1, 3) in the
     ``first`` one (H, W), known as so many standard deviations about a mean, its ``level`` (2,); where the camera has
-    ``shown`` (H, W) the scene, as far as one knows; ``pure``: it has been seen elsewhere as it is, so no mark is in it.
+    ``shown`` (H, W) the scene, as far as one knows; ``pure``: it has been seen elsewhere as it is, so no mark is in it;
+    what has been ``made`` of it.
     """
 
     reference: Reference
@@ -230,6 +244,17 @@ class Still(NamedTuple):
     shown: Tensor
     pure: bool
     settings: Settings
+    made: list[tuple[str, tuple[Tensor, ...], Any]]
+
+    def once(self, name: str, make: Callable[[], Made], *given: Tensor) -> Made:
+        """What is to be made of tensors that are ``given``, as it was made of the same ones: what a mark seems to be
+        mostly leads to the same pose again, and that to the same mark."""
+        for other, those, made in self.made:
+            if other == name and all(map(torch.equal, those, given)):
+                return made  # type: ignore[no-any-return]
+        new = make()
+        self.made.append((name, given, new))
+        return new
 
     def disagreement(self) -> Tensor | None:
         """By what (1, 3) least squares may be off if the blocks that fix it are wrong, None if all say the same."""
@@ -240,7 +265,11 @@ class Still(NamedTuple):
 
     def trial(self, shown: Tensor) -> Trial | None:
         """With less that is ``shown``; None if hardly anything is left of it."""
-        reference = behind(self.reference, self.home, ~shown, torch.ones_like(self.home[:, 0], dtype=torch.bool))
+        return self.once("trial", lambda: self._tried(shown), self.start, shown)
+
+    def _tried(self, shown: Tensor) -> Trial | None:
+        which = torch.ones_like(self.home[:, 0], dtype=torch.bool)
+        reference = self.once("behind", lambda: behind(self.reference, self.home, ~shown, which), shown)
         if not bool(reference.normal.total > LEAST):
             return None
         memory = Memory.none(reference)

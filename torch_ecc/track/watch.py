@@ -180,9 +180,9 @@ class Marks:
     def still(self, at: Tensor, image: Tensor, start: Tensor, pure: bool) -> Still:
         """The template ``at`` (1,)."""
         watch, state = Watch.of(self.state), self.state
-        alone, first = self.reference._replace(sight=None, heed=None).select(at), state["first"][0, 0]
+        alone, first = self.reference.through(None).select(at), state["first"][0, 0]
         shown, home = watch.marks == 0, state["start"][at]
-        return Still(alone, image, first, watch.level, start[at], home, shown, pure, self.settings)
+        return Still(alone, image, first, watch.level, start[at], home, shown, pure, self.settings, [])
 
     def known(self, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor) -> tuple[Tensor, Tensor]:
         """By what marks that are known bring poses into doubt, (R, 3, 3), and which (R,) are ``odd`` for all that."""

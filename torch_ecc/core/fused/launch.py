@@ -76,7 +76,7 @@ def _frames(values: Tensor, degree: int, size: torch.Size) -> Frames:
 
 
 def _grids(packed: Packed, k: int) -> Grids:
-    planes, weight, numbers = packed.tensors[3 * k : 3 * k + 3]
+    planes, weight, numbers = (tensor.contiguous() for tensor in packed.tensors[3 * k : 3 * k + 3])
     _, _, height, pitch = planes.shape
     even = weight.shape[:2] == (1, 1)
     return Grids(planes, weight, numbers, *_fixed(height, packed.widths[k], pitch, packed.steps[k], even))
@@ -87,7 +87,7 @@ def _trusted(trust: Trust | None, packed: Packed, start: Tensor) -> Trusted:
     across, count = -(-packed.widths[0] // BLOCK), packed.results[4].shape[2]
     lines = 1 << (max(across, count // across) - 1).bit_length()
     iterations, none = packed.results[2], packed.tensors[1]  # of the same types: else there would be another kernel
-    which, blocks, asked = trust or (iterations, None, None)
+    which, blocks, asked, *_ = trust or (iterations, None, None)
     asked = start.new_ones(len(which), dtype=torch.bool) if asked is None else asked
     fixed = _fixed(across, count, lines, blocks is not None)
     return Trusted(which.contiguous(), (none if blocks is None else blocks).contiguous(), asked.contiguous(), *fixed)

@@ -56,7 +56,8 @@ def solve(
     else:
         partial, found = call(library, image, start, reference.packed, how, trust, reference.distortion)
     pose, error, iterations, gain, sums, total, moments = found
-    normal = _counted(reference, moments, trust) if partial else reference.normal
+    judged = partial and (trust is None or trust.judged)
+    normal = _counted(reference, moments, trust) if judged else reference.normal
     return Solution(pose, error, iterations, gain, sums, total, normal)
 
 

@@ -27,7 +27,7 @@ NUMBERS = 122  # of a template, Numbers in csrc/template.h
 MOMENTS = 225  # of it, normal.Moments
 
 
-GRID = Struct("@8q")  # Grid in csrc/engine.cpp
+GRID = Struct("@9q")  # Grid in csrc/engine.cpp
 
 
 class _Packed(NamedTuple):
@@ -69,7 +69,15 @@ class Packed(_Packed):
         planes, weight, numbers = self.tensors[3 * k : 3 * k + 3]
         _, _, height, pitch = planes.shape
         places = (tensor.data_ptr() for tensor in (planes, weight, numbers))
-        return GRID.pack(*places, height, pitch, self.widths[k], self.steps[k], weight.shape[:2] == (1, 1))
+        even, alike = weight.shape[:2] == (1, 1), planes.stride(0) == 0
+        return GRID.pack(*places, height, pitch, self.widths[k], self.steps[k], even, alike)
+
+    def copies(self, count: int) -> Packed:
+        """Of one template, so many in the same memory."""
+        one_row = [tensor.dim() == 3 and tensor.shape[1] == 1 for tensor in self.tensors]  # which serves for all
+        pairs = zip(self.tensors, one_row, strict=True)
+        many = [tensor if one else tensor.expand(count, *tensor.shape[1:]) for tensor, one in pairs]
+        return Packed(many, self.widths, self.steps)
 
     def __reduce__(self) -> tuple[type[Packed], tuple[object, ...]]:
         return Packed, tuple(self)  # a copy lies elsewhere

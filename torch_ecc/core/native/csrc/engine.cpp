@@ -18,9 +18,10 @@ struct Grid {  // packed.GRID, of all templates
   const int16_t* planes;
   const float* weight;
   const Numbers* numbers;
-  int64_t height, pitch, width, step, even;  // even: one row of weights serves for all
+  int64_t height, pitch, width, step, even, alike;  // even: one row of weights serves for all; alike: one template does
 
-  Pixels of(int64_t b, const float* trust, int64_t across) const {
+  Pixels of(int64_t which, const float* trust, int64_t across) const {
+    const int64_t b = alike ? 0 : which;
     const Weights weights{even ? weight : weight + b * height * pitch, even ? 0 : pitch};
     return {planes + b * PLANES * height * pitch, numbers + b, weights, width, height, pitch, double(step), trust, across};
   }
