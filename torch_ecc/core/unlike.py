@@ -23,6 +23,7 @@ from torch_ecc.core.solution import Solution
 
 LEAST_UNLIKE = 0.01  # of the template's power: as much noise of any kind, light and the sampler may leave
 NEIGHBOURLY = 0.4  # correlation of the residuals of blocks with those beside them that noise never has
+MUCH = 0.1  # of the template's power: then the residuals themselves are looked at
 CLINGS = 1.5  # times as much as noise must residuals cling together: they are not noise, however much there is
 
 
@@ -32,11 +33,11 @@ def unlike(reference: Reference, found: Solution, score: Tensor, clings: Clingin
     scatter, ratio, _ = clings
     if scatter is None or ratio is None:
         return None
-    if is_cpu(score.device) and none_at_all(score.tolist(), scatter[:, 0].tolist()):
+    if is_cpu(score.device) and none_at_all(score.tolist(), scatter[:, 0].tolist(), ratio[:, 1:].tolist()):
         return None
-    coarse = (ratio[:, 1:].amin(1).mean(1) > 1) | (neighbourly(reference, found) > NEIGHBOURLY)
-    if is_cpu(score.device) and not bool(coarse.any()):
-        return None
+    coarse, much = ratio[:, 1:].amin(1).mean(1) > 1, (1 + MUCH) * score * score < 1
+    if not is_cpu(score.device) or bool(much.any()):
+        coarse |= (neighbourly(reference, found) > NEIGHBOURLY) & much
     normal, power = found.normal, found.gain.square()
     left = found.total[:, 6] / (power * normal.total).clamp(min=LEAST) - LEAST_UNLIKE * normal.contrast
     amount = left.clamp(min=0) * (1 - CLINGS / scatter.mean((1, 2))).clamp(min=0) * reference.patch
@@ -58,7 +59,12 @@ def neighbourly(reference: Reference, found: Solution) -> Tensor:
     return least
 
 
-def none_at_all(score: list[float], scatter: list[list[float]]) -> bool:
-    """Whether next to nothing is left of all templates, or it is noise: seen at once, as in most frames."""
-    each = zip(score, scatter, strict=True)
-    return all((1 + LEAST_UNLIKE) * s * s >= 1 or sum(of_blocks) <= CLINGS * len(of_blocks) for s, of_blocks in each)
+def none_at_all(score: list[float], scatter: list[list[float]], lines: list[list[list[float]]]) -> bool:
+    """Whether next to nothing is left of all templates, or it is noise, or it is little and along one axis: seen at
+    once, as in most frames."""
+    return all(
+        (1 + LEAST_UNLIKE) * s * s >= 1
+        or sum(of_blocks) <= CLINGS * len(of_blocks)
+        or ((1 + MUCH) * s * s >= 1 and sum(map(min, rows, columns)) <= len(rows))
+        for s, of_blocks, (rows, columns) in zip(score, scatter, lines, strict=True)
+    )
