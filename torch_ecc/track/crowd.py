@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.verdict import within_margin
-from torch_ecc.track.recover import disproved
+from torch_ecc.track.lost import disproved
 
 SAME = 2.0  # px between the centres: the same place
 EXPECTED, UNEXPECTED = 1.0, 3.0  # px from where it was expected: of the one that is there, and of the other

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.core.pose import unwrap
+from torch_ecc.track.lost import disproved
 
 
 class MaxStep(NamedTuple):
@@ -31,6 +33,14 @@ class MaxStep(NamedTuple):
     @property
     def known(self) -> bool:
         return min(self) < math.inf
+
+    def kept(self, estimate: Estimate, state: Mapping[str, Tensor]) -> Estimate:
+        """The ``estimate`` in which those are lost that are farther from their last pose in the ``state`` of a tracker
+        than that allows."""
+        if not self.known:
+            return estimate
+        beyond = self.exceeded(estimate.pose, state["pose"], state["since"])
+        return disproved(estimate, beyond & Status.good(estimate.status), Reason.TOO_FAR)
 
     def exceeded(self, pose: Tensor, last: Tensor, since: Tensor, slack: tuple[float, float] = (0.0, 0.0)) -> Tensor:
         """Which poses (..., 3) are farther from the ``last`` (..., 3) good ones than ``since`` (...) frames allow, and

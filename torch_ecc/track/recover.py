@@ -25,16 +25,16 @@ from torch_ecc.core.robust import RECOGNISED, Memory
 from torch_ecc.core.sampling import inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
-from torch_ecc.core.verdict import LEAST_COVERAGE, expected_score, just_as_good, predicted_sigma, unknown, within_margin
+from torch_ecc.core.verdict import LEAST_COVERAGE, expected_score, just_as_good, predicted_sigma, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, REACH, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
 from torch_ecc.track.budget import RESERVE, Budget
+from torch_ecc.track.lost import FAMILIAR, disproved, told, waiting
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.textureless import least_contrast, textureless
 from torch_ecc.track.together import TOGETHER, gone_together
 
-FAMILIAR = 0.8  # of its usual score: what has less where it was tracked to is searched for in the whole frame
 AT_ONCE = 4  # templates searched for in the whole of one frame; the others in turn
 KEPT = 2**25  # complex numbers prepared for searches of the whole frame, 256 MB
 NEARBY_AT_ONCE = 64  # and near where they are expected
@@ -95,15 +95,14 @@ def disbelieved(
     estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, reference: Reference, frame: Tensor
 ) -> Estimate:
     """The ``estimate`` in a ``frame`` (..., H, W) in which those that are still suspect are lost if they have slid away
-    from where they were expected, or hardly look like themselves and have been lost or are not in sight as a whole."""
+    from where they were expected, or hardly look like themselves and are not in sight as a whole."""
     index = (torch.tensor(suspects, device=start.device) & Status.good(estimate.status)).nonzero()[:, 0]
     if len(index) == 0:
         return estimate
     slid = (estimate.origin == Origin.TRACKED) & strayed(estimate, start, past, reference.place.radius, SLID)
     part = share_in_sight(reference.select(index), estimate.pose.detach()[index], frame) < WHOLE
     part &= (estimate.score < RECOGNISED * past.usual)[index]
-    strange = (past.since > 1) & (estimate.score < FAMILIAR * past.usual)
-    lost = torch.zeros_like(slid).index_put((index,), (slid | strange)[index] | part)
+    lost = torch.zeros_like(slid).index_put((index,), slid[index] | part)
     return disproved(estimate, lost, Reason.ELSEWHERE)
 
 
@@ -133,25 +132,6 @@ def of_a_part(reference: Reference, found: Estimate, frame: Tensor) -> Tensor:
     """Which templates (n,) were ``found`` in a ``frame`` (..., H, W) by less than half of them, beyond its border or
     not believed: something else may look like that part."""
     return found.coverage * share_in_sight(reference, found.pose.detach(), frame) < LEAST_COVERAGE
-
-
-def disproved(estimate: Estimate, lost: Tensor, reason: Reason) -> Estimate:
-    """The ``estimate`` in which those (R,) that are ``lost`` are so for a ``reason``."""
-    return estimate._replace(
-        status=torch.where(lost, int(Status.LOST), estimate.status).to(torch.int8),
-        reason=torch.where(lost, int(reason), estimate.reason).to(torch.int8),
-        covariance=torch.where(lost[:, None, None], unknown(estimate.covariance), estimate.covariance),
-    )
-
-
-def told(estimate: Estimate, templates: list[int], reason: Reason) -> Estimate:
-    """The ``estimate`` that tells of those ``templates`` that are lost that this ``reason`` is why."""
-    if not templates:
-        return estimate
-    index = torch.tensor(templates, device=estimate.status.device)
-    lost = estimate.status[index] == Status.LOST
-    codes = torch.where(lost, int(reason), estimate.reason[index]).to(torch.int8)
-    return estimate._replace(reason=estimate.reason.index_copy(0, index, codes))
 
 
 def familiar(found: Estimate, usual: Tensor) -> Tensor:
@@ -196,7 +176,7 @@ class Recovery:
         estimate = self.rejoin(images[0], estimate, past)
         due = self.due(estimate, past)
         if not due or not self.budget.left():
-            return told(estimate, due, Reason.WAITING)
+            return waiting(estimate, due, past.since, past.usual)
         images[:] = self.unmarked(images)
         if self.flat(images[0]):
             return told(estimate, due, Reason.FLAT)
@@ -208,7 +188,7 @@ class Recovery:
         gone = [r for r in due if suspects[r] and not kept[r] and not self.searched_all(past.since[r])]
         for k, r in enumerate(gone):
             if k == AT_ONCE or not self.budget.left(RESERVE):
-                estimate = told(estimate, gone[k:], Reason.WAITING)
+                estimate = waiting(estimate, gone[k:], past.since, past.usual)
                 break
             estimate = self.search_anywhere(images, estimate, past, r)
         return self.follow(images[0], estimate, start, past.usual) if gone else estimate

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torch_ecc.core.ambient import lasting, plain, threads_for, unrecorded
 from torch_ecc.core.criteria import Criterion, make_criterion, named
-from torch_ecc.core.estimate import Estimate, Reason, Status, Track
+from torch_ecc.core.estimate import Estimate, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor, shape_in_words
 from torch_ecc.core.native.engine import DEGREE, code_of
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
@@ -29,7 +29,7 @@ from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_le
 from torch_ecc.track.light import told_of_light
 from torch_ecc.track.look import Look
 from torch_ecc.track.max_step import MaxStep
-from torch_ecc.track.recover import Past, Recovery, disbelieved, disproved, from_rest, suspect
+from torch_ecc.track.recover import Past, Recovery, disbelieved, from_rest, suspect
 from torch_ecc.track.sensor import dead_in, kept, shown
 from torch_ecc.track.shutter import Shutter
 from torch_ecc.track.textureless import warn_of_textureless
@@ -332,15 +332,16 @@ class Tracker(nn.Module):
             estimate, marked = self._marks(images[0], estimate, start, odd)
             if marked:
                 self._use(self._unmarked)
-        estimate, past = self._within_reach(estimate), Past.of(state)
+        estimate, past = self.max_step.kept(estimate, state), Past.of(state)
         if self.search:
             estimate = self._recovery.not_led_away(estimate, start, past)
         doubtful = any(suspect(estimate, state["score"]))
         if doubtful:
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
-            estimate = self._within_reach(from_rest(reference, images[0], estimate, past, self.settings))
+            estimate = from_rest(reference, images[0], estimate, past, self.settings)
+            estimate = self.max_step.kept(estimate, state)
             if self.search:
-                estimate = self._within_reach(self._recovery(images, estimate, start, past))
+                estimate = self.max_step.kept(self._recovery(images, estimate, start, past), state)
                 suspects = suspect(estimate, state["score"])
                 estimate = disbelieved(estimate, suspects, start, past, reference, images[0])
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
@@ -349,14 +350,6 @@ class Tracker(nn.Module):
         suspects = suspect(apart, state["score"])
         apart = told_of_light(apart, images[0], state, self.references[0].grid.sides)
         return self._learned(image, advanced_in_doubt(state, apart, suspects), suspects)
-
-    def _within_reach(self, estimate: Estimate) -> Estimate:
-        """The ``estimate`` in which those are lost that are farther from their last pose than ``max_step`` allows."""
-        if not self.max_step.known:
-            return estimate
-        state: Any = self._buffers
-        beyond = self.max_step.exceeded(estimate.pose, state["pose"], state["since"])
-        return disproved(estimate, beyond & Status.good(estimate.status), Reason.TOO_FAR)
 
     def track(self, frame: Tensor) -> Estimate:
         """Same as calling the tracker."""
