@@ -20,7 +20,7 @@ from films.shot import SCENES, Film, Shot, eq11, frames, visible_bound
 from films.soak import Moment
 from results import load
 
-from torch_ecc import Status
+from torch_ecc import Reason, Status, Tracker
 from torch_ecc.paper.bound import cramer_rao
 from torch_ecc.sim import PlaneWaves
 
@@ -149,12 +149,21 @@ def test_where_it_was_last_it_has_stayed_or_it_is_not_there() -> None:
 
 
 def test_what_was_lost_is_believed_only_where_it_looks_like_itself() -> None:
-    """In the dark it has gone on 8 px to where it is not looked for first; least squares slides to another place."""
+    """In the dark it has gone on 8 px to where it is not looked for first; least squares slides to another place, and
+    a search finds it, if there is time for one."""
     shot = Shot(SCENES["micrograph"](41), 41, PLACED[:28], 61, (240, 320))
-    run = honesty.follow(shot.film(torch.cat((shot.clean[:15], torch.zeros(9, *FRAME), shot.clean[24:]))))
+    film = shot.film(torch.cat((shot.clean[:15], torch.zeros(9, *FRAME), shot.clean[24:])))
+    run = honesty.follow(film)
     assert bool((run.believed & ~run.off)[:14].all())
     assert not bool((run.believed & run.off)[23:].any())
     assert bool(run.believed[-1].all())
+    tracker = Tracker(film.frames[0], film.centers, film.size)
+    for frame in film.frames[1:24]:
+        tracker(frame)
+    tracker.credit = torch.full_like(tracker.credit, -9.0)
+    told = tracker(film.frames[24])
+    assert told.status[0] == Status.LOST
+    assert told.reason[0] == Reason.WAITING
 
 
 @pytest.mark.parametrize("seed", [2, 4, 6])
