@@ -10,17 +10,15 @@ per frame with the search of the whole frame alone and as shipped, alternately.
 from __future__ import annotations
 
 import math
-import os
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
-from work import WORKS, fine, waves
+from work import WORKS, data_folder, fine, waves
 
 from torch_ecc import Status, Tracker, texture
 from torch_ecc.core.estimate import Estimate
@@ -121,7 +119,7 @@ def sequence(name: str, prediction: str) -> list[str]:
 
 
 def main() -> None:
-    data = Path(sys.argv[1] if len(sys.argv) > 1 else os.environ["TORCH_ECC_DATA"])
+    data = data_folder(sys.argv[1] if len(sys.argv) > 1 else None)
     count = int(sys.argv[2]) if len(sys.argv) > 2 else 10
     scenes: dict[str, tuple[Scene, tuple[float, float]]] = {
         "waves": (waves(), (0.0, 0.0)),

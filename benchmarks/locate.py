@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -29,6 +28,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
+from work import data_folder
 
 from torch_ecc import Locator, Status, align, prepare, texture
 from torch_ecc.core.pose import compose, inverse, to_opencv
@@ -214,7 +214,7 @@ def trials(data: Path, count: int, seed: int) -> dict[str, Iterator[Trial]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("data", nargs="?", default=os.environ.get("TORCH_ECC_DATA"))
+    parser.add_argument("data", nargs="?")
     parser.add_argument("poses", nargs="?", type=int, default=200)
     parser.add_argument("threads", nargs="?", type=int, default=torch.get_num_threads())
     parser.add_argument("--seed", type=int, default=1)
@@ -225,7 +225,7 @@ def main() -> None:
     ours = ("hits", "trackable", "misses told", "false alarms", "worse", "rms px", "ms", "ambiguous", "bank ms")
     theirs = ("cv2 near", "cv2 ms", "cv2 fine hits", "cv2 fine ms")
     table = Table("set", *ours, *theirs, title=f"Global search, {options.threads} threads, times with quartiles")
-    for name, some in trials(Path(options.data), options.poses, options.seed).items():
+    for name, some in trials(data_folder(options.data), options.poses, options.seed).items():
         if not options.only or name in options.only:
             table.add_row(name, *measure(some))
     console.print(table)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 from pathlib import Path
 
 import torch
 from rich.console import Console
 from rich.table import Table
+from work import data_folder
 
 from torch_ecc import Status, Tracker
 from torch_ecc.commands.track import TrackJob, choose_templates
@@ -96,7 +96,7 @@ def basin(folder: Path, levels: int, search: bool) -> tuple[str, str]:
 
 
 def main() -> None:
-    data = Path(sys.argv[1] if len(sys.argv) > 1 else os.environ["TORCH_ECC_DATA"])
+    data = data_folder(sys.argv[1] if len(sys.argv) > 1 else None)
     table = Table("sequence", "largest px", "largest deg", "converged", title="Real sequences, default settings")
     for cells in mechanism(data / "mechanism_video"):
         table.add_row(*cells)

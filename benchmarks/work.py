@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,6 +20,14 @@ from torch_ecc.sim import Camera, GradientLight, Pads, PlaneWaves, Scene, Sequen
 
 STANDARD = Harmonic(20.0, 5.0, 40).closed()  # eq. (11): up to 3.1 px in x and in y, 4.4 px together, per frame
 SMALL = Harmonic(5.0, 1.25, 40).closed()  # up to 1.1 px per frame
+
+
+def data_folder(named: str | None) -> Path:
+    """That of the real sequences: the one ``named``, or else the one that TORCH_ECC_DATA names."""
+    folder = named or os.environ.get("TORCH_ECC_DATA")
+    if folder is None or not (Path(folder) / "stills").is_dir():
+        raise SystemExit(f"The folder of the real sequences is to be named, here or by TORCH_ECC_DATA, got {folder}")
+    return Path(folder)
 
 
 @dataclass(frozen=True, eq=False)
