@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torch_ecc.body.fusion import Fusion, fuse
 from torch_ecc.body.layout import Layout, Response
-from torch_ecc.core.ambient import plain
+from torch_ecc.core.ambient import plain, unrecorded
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.pose import compose, inverse, rotation
 from torch_ecc.core.reference import MARGIN
@@ -126,6 +126,7 @@ class Body(nn.Module):
 
     @plain
     @torch.no_grad()
+    @unrecorded
     def forward(self, estimate: Estimate) -> BodyEstimate:
         """Bodies in a frame, (R, ...) -> (G, ...), or in the F frames of a track. ValueError for other patches."""
         if not isinstance(estimate, Estimate):

@@ -102,17 +102,16 @@ def middle(bodies: Tensor, weight: Tensor, layout: Layout) -> Tensor:
 
 def fitted(patches: Patches, layout: Layout, pose: Tensor, steps: int) -> Fusion:
     """Least squares with the patches' weights, from ``pose`` (N, G, 3) on."""
-    weight = patches.weight[..., None]
+    weight, units = patches.weight[..., None], _units(layout)
     for _ in range(steps):
         there, slope = layout.predict(pose[..., layout.body, :])
         step, normal = _step(wrapped(patches.pose - there), slope, patches, layout)
-        pose = pose + step / _units(layout)
+        pose = pose + step / units
     there, _ = layout.predict(pose[..., layout.body, :])
     residual = wrapped(patches.pose - there)
     distance = (residual[..., None, :] @ patches.precision @ residual[..., None])[..., 0, 0]
     chi2 = layout.gather(weight * distance[..., None])[..., 0]
     freedom = 3 * layout.gather(weight)[..., 0] - 3
-    units = _units(layout)
     inverse = torch.linalg.inv_ex(normal)[0]
     scale = units[:, :, None] * units[:, None]
     covariance = inverse / scale
