@@ -30,11 +30,10 @@ def told(estimate: Estimate, templates: list[int], reason: Reason) -> Estimate:
     return estimate._replace(reason=estimate.reason.index_copy(0, index, codes))
 
 
-def waiting(estimate: Estimate, templates: list[int], since: Tensor, usual: Tensor) -> Estimate:
+def waiting(estimate: Estimate, templates: list[int], usual: Tensor) -> Estimate:
     """The ``estimate`` of a frame in which there is no time to search for those ``templates``: if they are lost that is
-    why, and they are lost if they have been, as (R,) frames ``since`` they had a place tell, and do not look as
-    ``usual`` (R,) where they are now."""
-    unsought = torch.zeros_like(since, dtype=torch.bool)
+    why, and they are lost if they do not look as ``usual`` (R,) where they are."""
+    unsought = torch.zeros_like(usual, dtype=torch.bool)
     unsought[templates] = True
-    strange = unsought & (since > 1) & (estimate.score < FAMILIAR * usual) & Status.good(estimate.status)
+    strange = unsought & (estimate.score < FAMILIAR * usual) & Status.good(estimate.status)
     return told(disproved(estimate, strange, Reason.WAITING), templates, Reason.WAITING)

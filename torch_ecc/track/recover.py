@@ -176,7 +176,7 @@ class Recovery:
         estimate = self.rejoin(images[0], estimate, past)
         due = self.due(estimate, past)
         if not due or not self.budget.left():
-            return waiting(estimate, due, past.since, past.usual)
+            return waiting(estimate, due, past.usual)
         images[:] = self.unmarked(images)
         if self.flat(images[0]):
             return told(estimate, due, Reason.FLAT)
@@ -188,7 +188,7 @@ class Recovery:
         gone = [r for r in due if suspects[r] and not kept[r] and not self.searched_all(past.since[r])]
         for k, r in enumerate(gone):
             if k == AT_ONCE or not self.budget.left(RESERVE):
-                estimate = waiting(estimate, gone[k:], past.since, past.usual)
+                estimate = waiting(estimate, gone[k:], past.usual)
                 break
             estimate = self.search_anywhere(images, estimate, past, r)
         return self.follow(images[0], estimate, start, past.usual) if gone else estimate
