@@ -51,6 +51,19 @@ def test_ome_zarr_has_axes(tmp_path):
     assert (source.fps, source.um_per_px, source.timed) == (None, None, False)
 
 
+@pytest.mark.parametrize("change", [{"type": "scale", "scale": [0.5]}, {"type": "scale", "scale": "abcde"}, {}, "scale"])
+def test_an_ome_zarr_scale_that_makes_no_sense_is_passed_over(tmp_path, change):
+    zarr = pytest.importorskip("zarr")
+    group = zarr.open_group(str(tmp_path / "s.zarr"), mode="w")
+    group.create_array("0", data=FRAMES)
+    axes = [{"name": name, "unit": "micrometer"} for name in "tczyx"]
+    sets = [{"path": "0", "coordinateTransformations": [change]}]
+    group.attrs["multiscales"] = [{"axes": axes, "datasets": sets}]
+    source = open_frames(tmp_path / "s.zarr", channel=1, slice=2)
+    assert (source.fps, source.um_per_px, source.timed) == (None, None, False)
+    np.testing.assert_array_equal(stacked(tmp_path / "s.zarr", channel=1, slice=2), FRAMES[:, 1, 2])
+
+
 def test_ome_zarr_tells_its_clock_and_scale(tmp_path):
     zarr = pytest.importorskip("zarr")
     group = zarr.open_group(str(tmp_path / "s.zarr"), mode="w")

@@ -155,14 +155,19 @@ def _open_zarr(zarr: Any, path: Path, choice: Choice) -> Medium:
 
 
 def _steps(image: Mapping[str, Any]) -> dict[str, float]:
-    """How far the planes and pixels of an OME-Zarr image are apart in s and um, by letters of axes, where it tells."""
+    """How far the planes and pixels of an OME-Zarr image are apart in s and um, by letters of axes, where it tells.
+    What is there and makes no sense is passed over."""
     axes, steps = image["axes"], np.ones(len(image["axes"]))
-    for owner in (image, image["datasets"][0]):
-        for change in owner.get("coordinateTransformations", ()):
-            steps = steps * change["scale"] if change.get("type") == "scale" else steps
-    units = [_UNITS.get(str(axis.get("unit")), 0.0) if isinstance(axis, dict) else 0.0 for axis in axes]
-    told = zip(axes, (steps * units).tolist(), strict=True)
-    return {str(axis["name"])[0].upper(): step for axis, step in told if 0 < step < math.inf}
+    try:
+        for owner in (image, image["datasets"][0]):
+            for change in owner.get("coordinateTransformations", ()):
+                if change["type"] == "scale":
+                    steps *= np.array([float(step) for _, step in zip(axes, change["scale"], strict=True)])
+        units = [_UNITS.get(axis.get("unit"), 0.0) for axis in axes]
+        told = zip(axes, (steps * units).tolist(), strict=True)
+        return {str(axis["name"])[0].upper(): step for axis, step in told if 0 < step < math.inf}
+    except (AttributeError, LookupError, TypeError, ValueError):
+        return {}
 
 
 def _only(stacks: Mapping[str, Any], where: str) -> Any:
