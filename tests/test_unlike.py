@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
-from torch_ecc import Estimate, align, prepare
+from torch_ecc import Estimate, Tracker, align, prepare
 from torch_ecc.core.reference import Reference
 from torch_ecc.sim.scene.waves import PlaneWaves
 
@@ -35,6 +37,27 @@ def test_sigma_covers_what_another_layer_does():
     error = ratios(0.35)
     assert len(error) >= 8
     assert 0.4 < error.square().mean().sqrt() < 1.2
+
+
+@pytest.mark.parametrize("size", [(5, 61), (61, 5), (11, 61), (21, 21)])
+def test_sigma_covers_a_blur_of_what_has_few_blocks(size: tuple[int, int]):
+    """Too few to tell how residuals cling together, or only along one side: then more than noise leaves is none."""
+    ratio = {}
+    for sigma in (0.0, 3.0):
+        ratio[sigma] = torch.cat([blurred(seed, size, sigma) for seed in range(12)])
+    assert 0.7 < ratio[0.0].square().mean().sqrt() < 1.3
+    assert len(ratio[3.0]) >= 4
+    assert ratio[3.0].square().mean().sqrt() < 2.5
+
+
+def blurred(seed: int, size: tuple[int, int], sigma: float) -> Tensor:
+    """Error over sigma (n, 3) of a template that is blurred in the frame, if its pose is believed."""
+    clean = PlaneWaves.random(seed=seed).render(START, FRAME).float()
+    soft = clean if sigma == 0 else gaussian_blur2d(clean, (25, 25), (sigma, sigma))
+    noise = 2 * torch.randn((2, 1, *FRAME), generator=torch.Generator().manual_seed(seed))
+    frames = (torch.cat((clean[:1], soft[1:])) + noise).round()
+    told = Tracker(frames[0], START[:1, :2], size, search=False)(frames[1])
+    return ((told.pose - START[1:]) / told.sigma)[told.status == 0]
 
 
 def test_sigma_of_noise_is_that_of_noise():

@@ -56,6 +56,11 @@ class Noise(NamedTuple):
         """The power (B,) of the noise of one frame."""
         return self.power * self.frames
 
+    @property
+    def of_both(self) -> Tensor:
+        """What noise leaves (B,) of a frame less the template, under a gain of 1."""
+        return self.power * (1 + self.frames)
+
 
 def template_noise(gray: Tensor, kept: Tensor, known: Tensor | None = None) -> Tensor:
     """Upper estimate (B,) of the noise of templates (B, 1, h, w), grey levels, where ``kept`` > 0, unless it is

@@ -53,7 +53,7 @@ def pinned(estimate: Estimate, reference: Reference, state: Mapping[str, Tensor]
     on_cpu = is_cpu(rms.device)
     if on_cpu and nothing_missing(*(value.tolist() for value in (known, rms, noise.power, noise.frames))):
         return estimate
-    moved, missing = estimate.displacement.detach(), 1 - rms.square() / (noise.power * (1 + noise.frames))
+    moved, missing = estimate.displacement.detach(), 1 - rms.square() / noise.of_both
     distance2, seen, stays = moved[:, :2].square().sum(1), Status.good(estimate.status), missing > LEAST_SHARE
     share = torch.where(seen & (distance2 <= NEAR**2) & (known >= 0), torch.where(stays, missing, 0.0), known)
     known.copy_(torch.where(seen & (distance2 > FAR**2) & stays, TEXTURE, share))
