@@ -160,7 +160,7 @@ def test_what_was_lost_is_believed_only_where_it_looks_like_itself() -> None:
     tracker = Tracker(film.frames[0], film.centers, film.size)
     for frame in film.frames[1:24]:
         tracker(frame)
-    tracker.credit = torch.full_like(tracker.credit, -9.0)
+    tracker.credit = torch.full_like(tracker.credit, -99.0)
     told = tracker(film.frames[24])
     assert told.status[0] == Status.LOST
     assert told.reason[0] == Reason.WAITING

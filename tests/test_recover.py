@@ -21,6 +21,7 @@ from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.recover import Past, Recovery, of_a_part, plausible, strained
 from torch_ecc.track.together import common_motion, gone_together
+from torch_ecc.track.watch import Watch
 
 FRAME = (240, 320)
 Y, X = np.mgrid[0 : FRAME[0], 0 : FRAME[1]].astype(float)
@@ -421,6 +422,28 @@ def test_searches_take_no_more_than_their_share(monkeypatch):
         counts[share] = len(searched)
         assert (te.Reason.WAITING in reasons) == (share < 1)
     assert counts[0.1] < counts[1.0]
+
+
+def test_what_a_search_near_costs_is_earned_where_it_is_needed():
+    """By 25 px there and back, over and over, without any credit: all is found."""
+    stack = still((0, 0, 0), *[(25 * (k % 4 // 2), -25 * (k % 4 // 2), 0) for k in range(1, 25)])
+    tracker = Tracker(stack[0], [(160.0, 120.0)], 61)
+    tracker.credit = torch.zeros_like(tracker.credit)
+    track = tracker.track_sequence(stack[1:])
+    assert (track.status == Status.CONVERGED).all()
+    assert (track.origin != Origin.ANYWHERE).all()
+
+
+def test_what_a_search_finds_has_no_marks(monkeypatch):
+    """It was not where it was looked for: that is why it has not fitted there."""
+    looked: list[int] = []
+    monkeypatch.setattr(Watch, "due", lambda self, odd, moved: looked.extend(odd.nonzero()[:, 0].tolist()) or [])
+    stack = still((0, 0, 0), (20, -18, 4), (20, -18, 4))
+    tracker = Tracker(stack[0], [(160.0, 120.0)], 61)
+    assert tracker(stack[1]).origin == Origin.NEARBY
+    assert not looked
+    tracker(stack[2] * (X < 150))
+    assert looked
 
 
 def test_what_is_much_like_a_template_but_another_thing_is_strained():

@@ -22,7 +22,7 @@ from torch_ecc.search.nearby import HALF_WIDTH, SCORE_MARGIN, Nearby
 REACH = 2 * HALF_WIDTH  # px to each side: twice as far as a search near can lead
 NEAR_MOST = 8  # places that are looked at near
 EQUAL_MARGIN = (1.1, 0.002)  # (a, b) as in AMBIGUITY_MARGIN, as finely as the search near tells places apart
-NEARER = 0.5  # of the distance to the next look-alike: a place found within it is believed to be the template's own
+NEARER = 0.4  # of the distance to the next look-alike: a place found within it is believed to be the template's own
 
 
 class LookAlikes(NamedTuple):

@@ -24,12 +24,12 @@ from torch_ecc.core.settings import Settings
 from torch_ecc.search.bank import SMALLEST_SEARCHED
 from torch_ecc.search.correlation import Correlator, Template, about_mean, detrended, peaks, rotated, span
 
-HALF_WIDTH = 24  # px to each side that are searched
+HALF_WIDTH = 32  # px to each side that are searched
 LARGEST_ANGLE, ANGLE_STEP = math.radians(9), math.radians(1.5)
 SPACINGS = (8, 4, 2, 1)  # px between the pixels that are compared
 LEAST_DENSITY = 2.0  # texture that is left, over what white noise of the same contrast would leave
 LARGEST_KERNEL = 49  # pixels across: they tell enough
-CANDIDATES = 3  # places per template that are brought to the answer: those with
+CANDIDATES = 5  # places per template that are brought to the answer: those with
 SCORE_MARGIN = 0.25  # s >= s_best - this, the nearest first
 FARTHER_MARGIN = (0.9, 0.002)  # (a, b): a farther place of score s is better if 1 - s < a (1 - s_nearer) - b
 

@@ -14,6 +14,7 @@ BURST = 3000.0  # frames of credit at most, and at first
 RESERVE = 500.0  # of it that searches of the whole frame leave to those near, which cost a tenth
 LEAST_FRAME = 400_000  # pixels' worth that every frame takes, however small it is: it has to come from somewhere
 SOLVE = 20  # times the pixels of a template: its solve
+DOUBTED = 10  # times what a frame takes: what it takes where templates were not found, before any search
 CORRELATION = 4  # times the pixels of a spectrum, for every angle
 
 

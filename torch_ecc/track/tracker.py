@@ -23,7 +23,7 @@ from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, seen_through
 from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator
 from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, skipped
-from torch_ecc.track.budget import Budget, income
+from torch_ecc.track.budget import DOUBTED, Budget, income
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told, with_new_parts
 from torch_ecc.track.light import told_of_light
@@ -178,16 +178,15 @@ class Tracker(nn.Module):
         view = view if tracker.dead is None else tracker.dead.repair(view)
         tracker.frame_mask, tracker.frame_shape = shown("find", frame_mask, view), tuple(view.shape)
         tracker.finds_marks = isinstance(frame_mask, str)
-        for name, value in Watch.begin(view, tracker.start)._asdict().items():
+        tracker.shutter.check(view.shape[2])
+        reference = seen_through(tracker._unmarked[0], tracker.frame_mask)
+        settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
+        located = Locator(reference, (view.shape[-2], view.shape[-1]), settings)(view, near)
+        begun(tracker._buffers, located.pose)
+        first = kept(filled(view, tracker.frame_mask))
+        for name, value in {"first": first, **Watch.begin(view, tracker.start)._asdict()}.items():
             tracker.register_buffer(name, value)
         tracker._use(tracker._unmarked)
-        settings = replace(tracker.settings, min_visible=LEAST_VISIBLE)
-        located = Locator(tracker.references[0], (view.shape[-2], view.shape[-1]), settings)(view, near)
-        tracker.register_buffer("first", kept(filled(view, tracker.frame_mask)))
-        tracker.shutter.check(view.shape[2])
-        begun(tracker._buffers, located.pose)
-        for name, value in Watch.begin(view, tracker.start)._asdict().items():
-            tracker.register_buffer(name, value)
         return tracker, located
 
     @property
@@ -328,28 +327,35 @@ class Tracker(nn.Module):
         images = [image.detach()]
         self._recovery.budget.earn(self.income)
         start, estimate, odd = self._look(image, images)
-        if self._marks is not None:
-            estimate, marked = self._marks(images[0], estimate, start, odd)
-            if marked:
-                self._use(self._unmarked)
+        strange = None if odd is None else start.new_tensor(suspect(estimate, state["score"])) > 0
+        estimate = self._past_marks(images[0], estimate, start, odd, None if strange is None else ~strange)
         estimate, past = self.max_step.kept(estimate, state), Past.of(state)
         if self.search:
             estimate = self._recovery.not_led_away(estimate, start, past)
-        doubtful = any(suspect(estimate, state["score"]))
-        if doubtful:
+        if doubtful := sum(suspect(estimate, state["score"])):
+            self._recovery.budget.earn(self.income * DOUBTED * doubtful / len(start))
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
-            estimate = from_rest(reference, images[0], estimate, past, self.settings)
-            estimate = self.max_step.kept(estimate, state)
+            estimate = self.max_step.kept(from_rest(reference, images[0], estimate, past, self.settings), state)
             if self.search:
                 estimate = self.max_step.kept(self._recovery(images, estimate, start, past), state)
-                suspects = suspect(estimate, state["score"])
-                estimate = disbelieved(estimate, suspects, start, past, reference, images[0])
+            if strange is not None:  # what is strange is searched for first: it has no marks in most frames
+                strange &= start.new_tensor(suspect(estimate, state["score"])) > 0
+                estimate = self.max_step.kept(self._past_marks(images[0], estimate, start, odd, strange), state)
+            if self.search:
+                estimate = disbelieved(estimate, suspect(estimate, state["score"]), start, past, reference, images[0])
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
         if not doubtful and apart is estimate:
             return self._learned(image, advanced(state, estimate), [False] * len(start))
         suspects = suspect(apart, state["score"])
         apart = told_of_light(apart, images[0], state, self.references[0].grid.sides)
         return self._learned(image, advanced_in_doubt(state, apart, suspects), suspects)
+
+    def _past_marks(self, *seen: Any) -> Estimate:
+        """What was ``seen``, see ``Marks``, without marks of the camera."""
+        estimate, new = self._marks(*seen) if self._marks else (seen[1], False)
+        if new:
+            self._use(self._unmarked)
+        return estimate
 
     def track(self, frame: Tensor) -> Estimate:
         """Same as calling the tracker."""

@@ -116,13 +116,20 @@ class Marks:
         watch, home = Watch.of(state), state["start"]
         return Marks(watch.seen(reference, home), watch.doubted(reference, home), settings, state, asked)
 
-    def __call__(self, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor | None) -> tuple[Estimate, bool]:
+    def __call__(
+        self, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor | None, which: Tensor | None
+    ) -> tuple[Estimate, bool]:
         """The ``estimate`` of an ``image`` (1, 1, H, W), from the ``start`` (R, 3) on, in which there is more left of
-        those that are ``odd`` (R,) bool, None for none, than any noise leaves; and whether there are new marks."""
-        if odd is None or not bool(odd.any()):
-            self.state["fitted"].copy_(estimate.pose.detach())
+        those that are ``odd`` (R,) bool, None for none, than any noise leaves; of these only those ``which`` (R,) are
+        looked at. And whether there are new marks."""
+        fitted, pose = self.state["fitted"], estimate.pose.detach()
+        if odd is None or which is None:
+            fitted.copy_(pose)
             return estimate, False
-        found = self.found(image, estimate, start, odd)
+        fitted.copy_(torch.where(odd[:, None], fitted, pose))
+        if not bool((odd & which).any()):
+            return estimate, False
+        found = self.found(image, estimate, start, odd & which)
         estimate = estimate._replace(covariance=estimate.covariance + found.doubt)
         for r, other in found.instead.items():
             estimate = estimate.put(torch.tensor([r], device=start.device), other)
@@ -132,7 +139,6 @@ class Marks:
     def found(self, image: Tensor, estimate: Estimate, start: Tensor, odd: Tensor) -> Found:
         """What tells of marks, if any of the templates is ``odd`` (R,)."""
         watch, pose = Watch.of(self.state), estimate.pose.detach()
-        watch.fitted.copy_(torch.where(odd[:, None], watch.fitted, pose))
         home, radius = self.state["start"], self.reference.place.radius
         moved, fitted = (pose_distance(there, home, radius=radius) for there in (pose, watch.fitted))
         pure = ((fitted > ELSEWHERE) & (watch.heed == 0)).tolist()
