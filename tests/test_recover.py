@@ -434,6 +434,15 @@ def test_what_a_search_near_costs_is_earned_where_it_is_needed():
     assert (track.origin != Origin.ANYWHERE).all()
 
 
+def test_what_has_turned_back_is_looked_for_where_it_was(monkeypatch):
+    """10 px a frame, and then 28 px back: 38 px from where it is expected, which is too far for a search near that."""
+    monkeypatch.setattr(Recovery, "search_anywhere", lambda self, images, estimate, *_: estimate)
+    stack = still((0, 0, 0), (10, 0, 0), (20, 0, 0), (30, 0, 0), (2, 0, 0))
+    track = Tracker(stack[0], [(160.0, 120.0)], 61).track_sequence(stack[1:])
+    assert (track.status == Status.CONVERGED).all()
+    assert track.origin[-1] == Origin.NEARBY
+
+
 def test_what_a_search_finds_has_no_marks(monkeypatch):
     """It was not where it was looked for: that is why it has not fitted there."""
     looked: list[int] = []

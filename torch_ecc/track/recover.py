@@ -180,18 +180,29 @@ class Recovery:
         images[:] = self.unmarked(images)
         if self.flat(images[0]):
             return told(estimate, due, Reason.FLAT)
-        start = torch.where((past.since % 2 == 0)[:, None], past.pose, start)  # by turns, as if it had gone on, or not
-        found = self.search_near(images[0], estimate, start, past, sorted(due))
-        estimate = self.follow(images[0], self.own(found, estimate, start, past), start, past.usual)
-        suspects = suspect(estimate, past.usual)
-        kept = plausible(estimate, start, past, self.reference.place.radius).tolist()
-        gone = [r for r in due if suspects[r] and not kept[r] and not self.searched_all(past.since[r])]
+        estimate, gone = self.searched_near(images[0], estimate, start, past, due)
+        ahead = (pose_distance(start, past.pose, radius=self.reference.place.radius) > BASIN).tolist()
+        if turned := [r for r in gone if ahead[r]]:  # or it has not gone on
+            estimate, lost = self.searched_near(images[0], estimate, past.pose, past, turned)
+            gone = [r for r in gone if r in lost or not ahead[r]]
+        gone = [r for r in gone if not self.searched_all(past.since[r])]
         for k, r in enumerate(gone):
             if k == AT_ONCE or not self.budget.left(RESERVE):
                 estimate = waiting(estimate, gone[k:], past.usual)
                 break
             estimate = self.search_anywhere(images, estimate, past, r)
         return self.follow(images[0], estimate, start, past.usual) if gone else estimate
+
+    def searched_near(
+        self, image: Tensor, estimate: Estimate, start: Tensor, past: Past, due: list[int]
+    ) -> tuple[Estimate, list[int]]:
+        """The ``estimate`` of an ``image`` with the templates ``due`` searched for around their ``start`` (R, 3), and
+        which of them have no plausible place yet."""
+        found = self.search_near(image, estimate, start, past, sorted(due))
+        estimate = self.follow(image, self.own(found, estimate, start, past), start, past.usual)
+        suspects = suspect(estimate, past.usual)
+        kept = plausible(estimate, start, past, self.reference.place.radius).tolist()
+        return estimate, [r for r in due if suspects[r] and not kept[r]]
 
     def unmarked(self, images: list[Tensor]) -> list[Tensor]:
         """The ``images`` in float; if the camera has marks, the first one alone, without them."""
