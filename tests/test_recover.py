@@ -16,6 +16,7 @@ from torch_ecc import Origin, Status, Tracker
 from torch_ecc.core.pose import compose
 from torch_ecc.io import open_frames
 from torch_ecc.sim.scene.scene import PlaneWaves
+from torch_ecc.track import tracker as follow
 from torch_ecc.track.advance import FARTHEST, beginning, coast
 from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.crowd import Crowd
@@ -432,6 +433,22 @@ def test_what_a_search_near_costs_is_earned_where_it_is_needed():
     track = tracker.track_sequence(stack[1:])
     assert (track.status == Status.CONVERGED).all()
     assert (track.origin != Origin.ANYWHERE).all()
+
+
+def test_what_no_search_can_find_costs_no_more_looks(monkeypatch):
+    """Noise alone is not tried where it was last; what is textured, and hidden, is."""
+    looks: list[int] = []
+    for name in ("from_rest", "disbelieved"):
+        real = getattr(follow, name)
+        monkeypatch.setattr(follow, name, lambda *given, real=real: (looks.append(1), real(*given))[1])
+    rng = np.random.default_rng(0)
+    noise = [noisy(np.full(FRAME, 90.0), rng) for _ in range(6)]
+    with pytest.warns(UserWarning, match="too little texture"):
+        tracker = Tracker(noise[0], [(160.0, 120.0)], 61)
+    assert (tracker.track_sequence(noise[1:]).status == Status.LOW_TEXTURE).all()
+    assert not looks
+    Tracker(still((0, 0, 0))[0], [(160.0, 120.0)], 61)(noise[0])
+    assert looks
 
 
 def test_what_has_turned_back_is_looked_for_where_it_was(monkeypatch):

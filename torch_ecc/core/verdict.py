@@ -224,12 +224,13 @@ def explained(
     as the correlation (B,) of what is believed, the ``match``."""
     status, reason = (_codes(k, failed.device).index_select(0, failed) for k in (0, 1))
     lost = status == Status.LOST
-    reason = torch.where(lost & (match < -min_score), int(Reason.INVERTED), reason)
-    soft = (lost | (reason == Reason.UNSURE)) & blurred(reference, found)
-    reason = torch.where(soft, int(Reason.BLURRED), reason)
-    reason = torch.where(lost & without_contrast(reference, found), int(Reason.FLAT), reason)
     textureless = noise_share(reference, reference.normal) > DOUBTFUL_SHARE  # that is why it was not found
     low = textureless & (lost | (status == Status.OUT_OF_VIEW))
+    if not (is_cpu(low.device) and bool(low.all())):
+        reason = torch.where(lost & (match < -min_score), int(Reason.INVERTED), reason)
+        soft = (lost | (reason == Reason.UNSURE)) & blurred(reference, found)
+        reason = torch.where(soft, int(Reason.BLURRED), reason)
+        reason = torch.where(lost & without_contrast(reference, found), int(Reason.FLAT), reason)
     reason = torch.where(low, int(Reason.NOISE), reason).to(torch.int8)
     return torch.where(low, int(Status.LOW_TEXTURE), status).to(torch.int8), reason
 

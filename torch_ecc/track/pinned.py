@@ -36,6 +36,8 @@ TEXTURE = -1.0  # as a share: it is not noise
 
 def held(estimate: Estimate, found: Solution, reference: Reference, state: Mapping[str, Tensor]) -> Estimate:
     """The ``estimate`` (R, ...) of what was ``found`` in a frame, whose covariance tells of both."""
+    if is_cpu(estimate.status.device) and min(estimate.status.tolist()) > Status.MAX_ITERATIONS:
+        return estimate  # nothing was
     estimate, moved = pinned(estimate, reference, state), estimate.displacement.detach()
     if is_cpu(moved.device) and all(x * x + y * y > ELSEWHERE**2 for x, y, _ in moved.tolist()):
         return estimate

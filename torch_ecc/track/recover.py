@@ -215,6 +215,13 @@ class Recovery:
         mean, square = (F.avg_pool2d(v, side, max(side // 2, 1)) for v in (about, about * about))
         return bool((square - mean * mean).amax() <= self.flattest)
 
+    def hopeful(self, suspects: list[bool], estimate: Estimate) -> int:
+        """How many of the ``suspects`` (R,) may be found, or are believed to be somewhere."""
+        if not any(suspects):
+            return 0
+        each = zip(suspects, self.hopeless, estimate.ok.tolist(), strict=True)
+        return sum(suspect and (ok or not hopeless) for suspect, hopeless, ok in each)
+
     def due(self, estimate: Estimate, past: Past) -> list[int]:
         """Which of the suspect templates to search for in this frame: less often those that have had a place since the
         last frame or too little texture for one, and never those that no search can find."""

@@ -332,8 +332,9 @@ class Tracker(nn.Module):
         estimate, past = self.max_step.kept(estimate, state), Past.of(state)
         if self.search:
             estimate = self._recovery.not_led_away(estimate, start, past)
-        if doubtful := sum(suspect(estimate, state["score"])):
-            self._recovery.budget.earn(self.income * DOUBTED * doubtful / len(start))
+        suspects = suspect(estimate, state["score"])
+        if doubted := self._recovery.hopeful(suspects, estimate):
+            self._recovery.budget.earn(self.income * DOUBTED * doubted / len(start))
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
             estimate = self.max_step.kept(from_rest(reference, images[0], estimate, past, self.settings), state)
             if self.search:
@@ -344,7 +345,7 @@ class Tracker(nn.Module):
             if self.search:
                 estimate = disbelieved(estimate, suspect(estimate, state["score"]), start, past, reference, images[0])
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
-        if not doubtful and apart is estimate:
+        if not any(suspects) and apart is estimate:
             return self._learned(image, advanced(state, estimate), [False] * len(start))
         suspects = suspect(apart, state["score"])
         apart = told_of_light(apart, images[0], state, self.references[0].grid.sides)
