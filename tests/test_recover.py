@@ -387,6 +387,19 @@ def test_the_largest_step_tells_equal_parts_apart():
     assert (estimate.displacement[0, :2] - torch.tensor([26.0, 0.0])).abs().max() < 0.1
 
 
+@pytest.mark.parametrize("jump", [(15, 6), (18, 8), (26, 11)])
+def test_of_many_look_alikes_the_nearest_counts(jump):
+    """Pads 36 px apart: a search of the whole frame meets some hundred of them, and knows a few."""
+    u, v = (X - 160) % 36 - 18, (Y - 120) % 36 - 18
+    pads = 70 + 100 * edge(8 - abs(18 - abs(u))) * edge(6 - abs(18 - abs(v)))
+    rng, moved = np.random.default_rng(0), np.roll(pads, jump[::-1], (0, 1))
+    tracker = Tracker(noisy(pads, rng), [(160.0, 120.0)], 61)
+    for _ in range(3):
+        estimate = tracker(noisy(moved, rng))
+        assert estimate.status == Status.LOST
+        assert estimate.reason == te.Reason.AMBIGUOUS
+
+
 @pytest.mark.parametrize("step", [5.0, (5.0,), (0.0, 1.0), (5.0, float("nan")), ("a", 1.0), (-1.0, 2.0), "ab"])
 def test_a_largest_step_is_two_numbers(step):
     with pytest.raises(ValueError, match=r"max_step: expected \(px, deg\) per frame, both > 0, got"):

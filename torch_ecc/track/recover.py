@@ -215,13 +215,6 @@ class Recovery:
         mean, square = (F.avg_pool2d(v, side, max(side // 2, 1)) for v in (about, about * about))
         return bool((square - mean * mean).amax() <= self.flattest)
 
-    def hopeful(self, suspects: list[bool], estimate: Estimate) -> int:
-        """How many of the ``suspects`` (R,) may be found, or are believed to be somewhere."""
-        if not any(suspects):
-            return 0
-        each = zip(suspects, self.hopeless, estimate.ok.tolist(), strict=True)
-        return sum(suspect and (ok or not hopeless) for suspect, hopeless, ok in each)
-
     def due(self, estimate: Estimate, past: Past) -> list[int]:
         """Which of the suspect templates to search for in this frame: less often those that have had a place since the
         last frame or too little texture for one, and never those that no search can find."""
@@ -312,11 +305,9 @@ class Recovery:
     def doubtful(self, found: Estimate, index: Tensor, start: Tensor, past: Past, expected: Tensor) -> Tensor:
         """Of templates at ``index`` (n,) whether the places ``found`` (R, ...) may be those of look-alikes: (n,) bool.
         These are known around the last place only; farther away are only places that were ``expected`` (n,)."""
-        unseen = [r for r in index.tolist() if r not in self.near]
-        if unseen:
-            self.near |= zip(unseen, self._look_near(unseen, past), strict=True)
         raised = self.raised(found.score, past.usual)
-        twin = torch.stack([self.near[r].nearest(found.score[r], raised[r]) for r in index.tolist()])
+        which: list[int] = index.tolist()
+        twin = torch.stack([self.near_twin(r, found.score[r], raised[r], which, past) for r in which])
         radius = self.reference.place.radius[index]
         distance, moved = (pose_distance(found.pose[index], p[index], radius=radius) for p in (start, past.pose))
         guessed = past.since[index] > 1  # where it is expected, which may be far from where it was last
@@ -369,7 +360,16 @@ class Recovery:
         if r not in self.anywhere:
             first = past.first if len(past.first) == 1 else past.first[r : r + 1]
             self.anywhere[r] = look_alikes_anywhere(locator, first.float(), past.home[r])
-        return self.anywhere[r].nearest(score, self.raised(score, past.usual)[r])
+        raised = self.raised(score, past.usual)[r]
+        twin = self.anywhere[r].nearest(score, raised)  # of many it knows the best, not the nearest
+        return twin if bool(twin.isinf()) else twin.minimum(self.near_twin(r, score, raised, [r], past))
+
+    def near_twin(self, r: int, score: Tensor, raised: Tensor, which: list[int], past: Past) -> Tensor:
+        """The same () of those within REACH, looked for around all templates ``which`` it is about at once."""
+        unseen = [r for r in which if r not in self.near]
+        if unseen:
+            self.near |= zip(unseen, self._look_near(unseen, past), strict=True)
+        return self.near[r].nearest(score, raised)
 
     @lasting
     def _look_near(self, templates: list[int], past: Past) -> list[LookAlikes]:

@@ -28,6 +28,7 @@ from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told, with_new_parts
 from torch_ecc.track.light import told_of_light
 from torch_ecc.track.look import Look
+from torch_ecc.track.lost import hopeful
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Past, Recovery, disbelieved, from_rest, suspect
 from torch_ecc.track.sensor import dead_in, kept, shown
@@ -270,9 +271,8 @@ class Tracker(nn.Module):
     def get_extra_state(self) -> dict[str, Any]:
         """What a state is of, beside its tensors: a part of ``state_dict``."""
         size = [n - 2 * MARGIN for n in self.template.shape[2:]]
-        given = {"templates": len(self.template), "size": size, "frame": list(self.frame_shape)}
-        learning = {"average": self.rounds[0], "renew": self.rounds[1]}
-        return {**given, **learning, "levels": self.levels, "criterion": named(self.criterion)}
+        given = {"templates": len(self.template), "size": size, "frame": list(self.frame_shape), "levels": self.levels}
+        return {**given, "average": self.rounds[0], "renew": self.rounds[1], "criterion": named(self.criterion)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Refuses the state of another kind of tracker."""
@@ -333,7 +333,7 @@ class Tracker(nn.Module):
         if self.search:
             estimate = self._recovery.not_led_away(estimate, start, past)
         suspects = suspect(estimate, state["score"])
-        if doubted := self._recovery.hopeful(suspects, estimate):
+        if doubted := hopeful(suspects, self._recovery.hopeless, estimate):
             self._recovery.budget.earn(self.income * DOUBTED * doubted / len(start))
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
             estimate = self.max_step.kept(from_rest(reference, images[0], estimate, past, self.settings), state)
