@@ -22,7 +22,7 @@ from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.recover import Past, Recovery, of_a_part, plausible, strained
 from torch_ecc.track.together import common_motion, gone_together
-from torch_ecc.track.watch import Watch
+from torch_ecc.track.watch import Marks, Watch
 
 FRAME = (240, 320)
 Y, X = np.mgrid[0 : FRAME[0], 0 : FRAME[1]].astype(float)
@@ -483,6 +483,19 @@ def test_what_a_search_finds_has_no_marks(monkeypatch):
     assert not looked
     tracker(stack[2] * (X < 150))
     assert looked
+
+
+def test_marks_are_looked_for_in_what_the_camera_has_shown(monkeypatch):
+    """Also after a search, which looks at what is left without those that are known."""
+    seen: list[torch.Tensor] = []
+    found = Marks.found
+    monkeypatch.setattr(Marks, "found", lambda self, image, *rest: (seen.append(image), found(self, image, *rest))[1])
+    monkeypatch.setattr(Recovery, "unmarked", lambda self, images: [torch.zeros_like(images[0], dtype=torch.float32)])
+    stack = still((0, 0, 0), (20, -18, 4))
+    hidden = stack[1] * (X < 150)
+    Tracker(stack[0], [(160.0, 120.0)], 61)(hidden)
+    assert len(seen) == 1
+    assert torch.equal(seen[0][0, 0], hidden)
 
 
 def test_what_is_much_like_a_template_but_another_thing_is_strained():

@@ -115,6 +115,12 @@ def _range(values: Tensor) -> str:
     return f"values from {values.min():g} to {values.max():g}"
 
 
-def shape_in_words(shape: tuple[int, ...]) -> str:
+def require_as_first(where: str, image: Tensor, first: tuple[int, ...]) -> None:
+    """ValueError for an ``image`` of another shape than that of the ``first`` one."""
+    if image.shape != first:
+        raise ValueError(f"{where}: frame must be {_in_words(first)} as the first, got {_in_words(image.shape)}")
+
+
+def _in_words(shape: tuple[int, ...]) -> str:
     """What images (B, 1, H, W) are."""
     return f"{shape[0]} image{'s' if shape[0] > 1 else ''} of {shape[3]}x{shape[2]} px"

@@ -276,15 +276,16 @@ class Recovery:
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
 
-    def not_led_away(self, estimate: Estimate, start: Tensor, past: Past) -> Estimate:
-        """The ``estimate`` in which those templates are lost that were tracked away from where they were expected, or
-        to where nobody has seen them go, and that look-alikes may have led there."""
+    def not_led_away(self, estimate: Estimate, start: Tensor, past: Past, which: Tensor | None = None) -> Estimate:
+        """The ``estimate`` in which those templates ``which`` (R,), None for all, are lost that were tracked away from
+        where they were expected, or to where nobody has seen them go, and that look-alikes may have led there."""
         each = zip((estimate.pose - start).tolist(), past.since.tolist(), strict=True)
         if all(since == 1 and math.hypot(x, y) + self.farthest * abs(q) <= BASIN for (x, y, q), since in each):
             return estimate  # as in most frames, of which this is to be seen at once
         radius = self.reference.place.radius
         far = pose_distance(estimate.pose, start, radius=radius) > BASIN
         strays = Status.good(estimate.status) & (far | (past.since > 1))
+        strays = strays if which is None else strays & which
         index = strays.nonzero()[:, 0]
         if len(index) == 0:
             return estimate

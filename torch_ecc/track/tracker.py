@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch_ecc.core.ambient import lasting, plain, threads_for, unrecorded
 from torch_ecc.core.criteria import Criterion, make_criterion, named
 from torch_ecc.core.estimate import Estimate, Track
-from torch_ecc.core.frame import as_device, as_gray, as_image, require_tensor, shape_in_words
+from torch_ecc.core.frame import as_device, as_gray, as_image, require_as_first, require_tensor
 from torch_ecc.core.native.engine import DEGREE, code_of
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
 from torch_ecc.core.pyramid import check_levels, pyramid
@@ -54,27 +54,26 @@ class Tracker(nn.Module):
     (x, y) px, of ``size`` px (one number or (h, w)). ``criterion``: "ecc", "ecc_paper", "ssd" or an object
     (criteria.Criterion); ``illumination`` of "ecc": "gain" (the paper's), "linear", "quadratic"; ``interpolation``:
     "bilinear", "bspline3", "bspline5"; ``tolerance``: px at the template's corner; ``levels``: pyramid levels;
-    ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``:
-    (h, w) or (R, h, w), True or a weight > 0 where the template counts; ``frame_mask``: (H, W), True or > 0 where the
+    ``prediction``: start each frame where the last one ended ("hold") or one step further ("velocity"); ``mask``: (h,
+    w) or (R, h, w), True or a weight > 0 where the template counts; ``frame_mask``: (H, W), True or > 0 where the
     camera shows the scene, and not a mark of its own (aperture, stripe, dust): what of a template is there, or within
-    some 3 to 6 px, is out of sight, as beyond the frame's border, or "find": what stays where it was in the first
-    frame while the templates move is taken for such marks (``track.still``; a sheen that stays may be, too), which by
-    default add to sigma alone unless they lead elsewhere (``track.watch``); ``device``: where everything lives
-    (default: the frame's); ``min_score``: below it a template is lost;
-    ``min_visible``: with less of its weight in sight it is out of view; ``robust``: blocks of pixels that do not fit,
-    as of what covers a part of a template, count less (``core.robust``); ``search``: look for a template that is lost,
-    or looks less like itself than usual, near where it is expected and, if it has no plausible place, in the whole
-    frame at any angle: in every frame at first, and ever more seldom the longer it stays so (every 16th frame in the
-    end); ``search_share``: of the time, what searches may take at most in the long run (1: no bound); ``max_step``:
-    (px, deg), how far a template's centre moves, and how far it turns, from one frame to the next at most: nothing
-    farther is believed, nor looked at; ``backend``: "auto", "torch", "native" or "fused", see settings.Settings.
-    ``average``: the templates become the mean of so many frames, the first one among them: less noise in dim pictures.
-    ``renew``: they become the mean of the last so many frames, again and again, for surfaces that change; anchored to
-    the first such mean, so that nothing adds up, and sigma tells what the anchor is still worth. Nothing is learned
-    from frames that are not CONVERGED or are covered, nor where something is suddenly another. ``line_time``: seconds
-    from the exposure of one row to the next, of a camera with a rolling shutter that takes ``fps`` frames per second:
-    poses are those of the instant at which the row of the template's centre is exposed (``track.shutter``); in the
-    first frame it is at rest.
+    some 3 to 6 px, is out of sight, as beyond the frame's border, or "find": what stays where it was in the first frame
+    while the templates move is taken for such marks (``track.still``; a sheen that stays may be, too), which by default
+    add to sigma alone unless they lead elsewhere (``track.watch``); ``device``: where everything lives (default: the
+    frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in sight it is out of
+    view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
+    (``core.robust``); ``search``: look for a template that is lost, or looks less like itself than usual, near where it
+    is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
+    more seldom the longer it stays so (every 16th frame in the end); ``search_share``: of the time, what searches may
+    take at most in the long run (1: no bound); ``max_step``: (px, deg), how far a template's centre moves, and how far
+    it turns, from one frame to the next at most: nothing farther is believed, nor looked at; ``backend``: "auto",
+    "torch", "native" or "fused", see settings.Settings. ``average``: the templates become the mean of so many frames,
+    the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last so many frames,
+    again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up, and sigma tells
+    what the anchor is still worth. Nothing is learned from frames that are not CONVERGED or are covered, nor where
+    something is suddenly another. ``line_time``: seconds from the exposure of one row to the next, of a camera with a
+    rolling shutter that takes ``fps`` frames per second: poses are those of the instant at which the row of the
+    template's centre is exposed (``track.shutter``); in the first frame it is at rest.
 
     What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
     with its own options. A state comes whole or not at all; what does not fit is refused before anything is changed.
@@ -318,17 +317,15 @@ class Tracker(nn.Module):
     def _forward(self, frame: Tensor) -> Estimate:
         state: Any = self._buffers  # a module's attributes are slow
         image = as_image("track", "frame", frame, state["pose"].device)
-        if image.shape != self.frame_shape:
-            first, other = shape_in_words(self.frame_shape), shape_in_words(image.shape)
-            raise ValueError(f"track: frame must be {first} as the first, got {other}")
+        require_as_first("track", image, self.frame_shape)
         if self.learns and self.template._version != self._version:  # by another handle of the same state
             self._use(self._prepared(self._buffers))
         image = image if self.dead is None else self.dead.repair(image)
         images = [image.detach()]
         self._recovery.budget.earn(self.income)
         start, estimate, odd = self._look(image, images)
-        strange = None if odd is None else start.new_tensor(suspect(estimate, state["score"])) > 0
-        estimate = self._past_marks(images[0], estimate, start, odd, None if strange is None else ~strange)
+        view, strange = images[0], None if odd is None else start.new_tensor(suspect(estimate, state["score"])) > 0
+        estimate = self._past_marks(view, estimate, start, odd, None if strange is None else ~strange)
         estimate, past = self.max_step.kept(estimate, state), Past.of(state)
         if self.search:
             estimate = self._recovery.not_led_away(estimate, start, past)
@@ -341,7 +338,8 @@ class Tracker(nn.Module):
                 estimate = self.max_step.kept(self._recovery(images, estimate, start, past), state)
             if strange is not None:  # what is strange is searched for first: it has no marks in most frames
                 strange &= start.new_tensor(suspect(estimate, state["score"])) > 0
-                estimate = self.max_step.kept(self._past_marks(images[0], estimate, start, odd, strange), state)
+                estimate = self.max_step.kept(self._past_marks(view, estimate, start, odd, strange), state)
+                estimate = self._recovery.not_led_away(estimate, start, past, strange) if self.search else estimate
             if self.search:
                 estimate = disbelieved(estimate, suspect(estimate, state["score"]), start, past, reference, images[0])
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
@@ -351,9 +349,11 @@ class Tracker(nn.Module):
         apart = told_of_light(apart, images[0], state, self.references[0].grid.sides)
         return self._learned(image, advanced_in_doubt(state, apart, suspects), suspects)
 
-    def _past_marks(self, *seen: Any) -> Estimate:
-        """What was ``seen``, see ``Marks``, without marks of the camera."""
-        estimate, new = self._marks(*seen) if self._marks else (seen[1], False)
+    def _past_marks(self, image: Tensor, estimate: Estimate, start: Tensor, *which: Tensor | None) -> Estimate:
+        """The ``estimate`` without marks of the camera: see ``Marks``."""
+        if self._marks is None:
+            return estimate
+        estimate, new = self._marks(image, estimate, start, *which)
         if new:
             self._use(self._unmarked)
         return estimate
