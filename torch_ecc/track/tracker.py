@@ -63,17 +63,17 @@ class Tracker(nn.Module):
     frame's); ``min_score``: below it a template is lost; ``min_visible``: with less of its weight in sight it is out of
     view; ``robust``: blocks of pixels that do not fit, as of what covers a part of a template, count less
     (``core.robust``); ``search``: look for a template that is lost, or looks less like itself than usual, near where it
-    is expected and, if it has no plausible place, in the whole frame at any angle: in every frame at first, and ever
-    more seldom the longer it stays so (every 16th frame in the end); ``search_share``: of the time, what searches may
-    take at most in the long run (1: no bound); ``max_step``: (px, deg), how far a template's centre moves, and how far
-    it turns, from one frame to the next at most: nothing farther is believed, nor looked at; ``backend``: "auto",
-    "torch", "native" or "fused", see settings.Settings. ``average``: the templates become the mean of so many frames,
-    the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last so many frames,
-    again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up, and sigma tells
-    what the anchor is still worth. Nothing is learned from frames that are not CONVERGED or are covered, nor where
-    something is suddenly another. ``line_time``: seconds from the exposure of one row to the next, of a camera with a
-    rolling shutter that takes ``fps`` frames per second: poses are those of the instant at which the row of the
-    template's centre is exposed (``track.shutter``); in the first frame it is at rest.
+    is expected, or was last, and, if it has no plausible place, in the whole frame at any angle: in every frame at
+    first, and ever more seldom the longer it stays so (every 16th frame in the end); ``search_share``: of the time,
+    what searches may take at most in the long run (1: no bound); ``max_step``: (px, deg), how far a template's centre
+    moves, and how far it turns, from one frame to the next at most: nothing farther is believed, nor looked at;
+    ``backend``: "auto", "torch", "native" or "fused", see settings.Settings. ``average``: the templates become the mean
+    of so many frames, the first one among them: less noise in dim pictures. ``renew``: they become the mean of the last
+    so many frames, again and again, for surfaces that change; anchored to the first such mean, so that nothing adds up,
+    and sigma tells what the anchor is still worth. Nothing is learned from frames that are not CONVERGED or are
+    covered, nor where something is suddenly another. ``line_time``: seconds from the exposure of one row to the next,
+    of a camera with a rolling shutter that takes ``fps`` frames per second: poses are those of the instant at which the
+    row of the template's centre is exposed (``track.shutter``); in the first frame it is at rest.
 
     What it is, templates and poses, is in its ``state_dict``: a tracker that loads one goes on as if it were the other,
     with its own options. A state comes whole or not at all; what does not fit is refused before anything is changed.
