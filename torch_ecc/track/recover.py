@@ -170,8 +170,8 @@ class Recovery:
         self.anywhere: dict[int, LookAlikes] = {}
 
     def __call__(self, images: list[Tensor], estimate: Estimate, start: Tensor, past: Past) -> Estimate:
-        """The ``estimate`` of a frame with those templates searched for that are suspect and due: at ``start`` (R, 3)
-        first, then in the whole frame. ``images``: the frame, and as many coarser levels as there are already.
+        """The ``estimate`` of a frame with those templates searched for that are suspect and due: around ``start``
+        (R, 3), where they were last, then anywhere. ``images``: the frame, and as many coarser levels as there are.
         """
         estimate = self.rejoin(images[0], estimate, past)
         due = self.due(estimate, past)
