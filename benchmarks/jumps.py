@@ -28,7 +28,8 @@ from torch_ecc.io import open_frames
 from torch_ecc.sim import Camera, Pads, Scene, Speckle
 from torch_ecc.sim.camera.still import image_scene
 from torch_ecc.track.advance import PREDICTIONS
-from torch_ecc.track.recover import Past, Recovery
+from torch_ecc.track.doubt import Past
+from torch_ecc.track.recover import Recovery
 
 MIDDLE = torch.tensor([320.0, 240.0, 0.0], dtype=torch.float64)
 LENGTHS, TURNS = (4.0, 8.0, 12.0, 16.0, 24.0, 40.0), (0.0, 2.0, 5.0, 10.0)  # px, deg

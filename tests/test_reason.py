@@ -19,7 +19,7 @@ from torch_ecc.cli import app
 from torch_ecc.commands.track import Session, TrackJob
 from torch_ecc.core.filters import blur
 from torch_ecc.sim import Pads, PlaneWaves
-from torch_ecc.track.recover import Past, disbelieved
+from torch_ecc.track.doubt import Past, disbelieved
 
 STATUS = {
     Reason.NONE: Status.CONVERGED,

@@ -23,6 +23,7 @@ REACH = 2 * HALF_WIDTH  # px to each side: twice as far as a search near can lea
 NEAR_MOST = 8  # places that are looked at near
 EQUAL_MARGIN = (1.1, 0.002)  # (a, b) as in AMBIGUITY_MARGIN, as finely as the search near tells places apart
 NEARER = 0.4  # of the distance to the next look-alike: a place found within it is believed to be the template's own
+RIVAL = 0.8  # of what is believed of a template at one place, believed at another: it may be either
 
 
 class LookAlikes(NamedTuple):

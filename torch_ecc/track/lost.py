@@ -11,14 +11,6 @@ from torch_ecc.core.verdict import unknown
 FAMILIAR = 0.8  # of its usual score: what has less where it was tracked to is searched for in the whole frame
 
 
-def hopeful(suspects: list[bool], hopeless: list[bool], estimate: Estimate) -> int:
-    """How many of the ``suspects`` (R,) are not ``hopeless`` (R,), or are believed to be somewhere."""
-    if not any(suspects):
-        return 0
-    each = zip(suspects, hopeless, estimate.ok.tolist(), strict=True)
-    return sum(suspect and (ok or not lost) for suspect, lost, ok in each)
-
-
 def disproved(estimate: Estimate, lost: Tensor, reason: Reason) -> Estimate:
     """The ``estimate`` in which those (R,) that are ``lost`` are so for a ``reason``."""
     return estimate._replace(

@@ -8,9 +8,7 @@ gone together, that is where the others are looked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -22,15 +20,28 @@ from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import RECOGNISED, Memory
-from torch_ecc.core.sampling import inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
-from torch_ecc.core.verdict import LEAST_COVERAGE, expected_score, just_as_good, predicted_sigma, within_margin
-from torch_ecc.search.locate import LEAST_VISIBLE, Locator, image_pyramid, pose_distance
-from torch_ecc.search.look_alikes import NEARER, REACH, LookAlikes, look_alikes_anywhere, look_alikes_near
+from torch_ecc.core.verdict import expected_score, within_margin
+from torch_ecc.search.locate import LEAST_VISIBLE, SUPPRESSION, Locator, detrended_zncc_at, image_pyramid, pose_distance
+from torch_ecc.search.look_alikes import NEARER, REACH, RIVAL, LookAlikes, look_alikes_anywhere, look_alikes_near
 from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
 from torch_ecc.track.budget import RESERVE, Budget
-from torch_ecc.track.lost import FAMILIAR, disproved, told, waiting
+from torch_ecc.track.doubt import (
+    BASIN,
+    WHOLE,
+    Past,
+    beats,
+    familiar,
+    gone_elsewhere,
+    of_a_part,
+    plausible,
+    share_in_sight,
+    strained,
+    strayed,
+    suspect,
+)
+from torch_ecc.track.lost import disproved, told, waiting
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.textureless import least_contrast, textureless
 from torch_ecc.track.together import TOGETHER, gone_together
@@ -42,68 +53,9 @@ PATIENCE = 16  # frames in which a lost template is searched for at every chance
 SELDOM = 16  # frames between two searches for what has been lost for long
 ALIGNED, NEARBY_ALIGNED = 20_000_000, 1_000_000  # pixels that can be read while a search aligns what it has found
 KNOWN = 0.75 * REACH  # px: look-alikes of a place found near are known if it is not farther from the last one
-BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
 AT_REST = 8.0  # px at the farthest pixel: what has moved more has not stayed where it was
+ALIKE = 0.55  # of the usual score: a part that is not believed need not be covered, it may be that of another thing
 COARSE = (8.0, ANGLE_STEP)  # px, rad: as finely as places are told apart before they are refined
-SLID = 16.0  # px beyond the last step: where something else was tracked, if it does not look as usual either
-WHOLE = 0.9  # of a template's weight must be in sight where it has leapt to: many things have parts that look alike
-STRAIN = 0.1  # px at the farthest pixel: less is a sampler's own
-STRAINED = 8.0  # times the sigma that noise as large as the residuals would leave: what was found is something else
-
-
-class Past(NamedTuple):
-    """What is known of R templates before a frame: last good ``pose`` (R, 3), ``since`` (R,) how many frames, if a
-    search has ``found`` it (R,) 0 or 1, ``usual`` score (R,), ``suspect_frames`` (R,) in a row, and the ``first`` frame
-    (1 or R, 1, H, W), where they were at ``home`` (R, 3). ``velocity`` (R, 3): what is expected to be added since."""
-
-    pose: Tensor
-    velocity: Tensor
-    since: Tensor
-    found: Tensor
-    usual: Tensor
-    suspect_frames: Tensor
-    first: Tensor
-    home: Tensor
-
-    @staticmethod
-    def of(state: Mapping[str, Tensor]) -> Past:
-        """From a tracker's buffers."""
-        names = ("pose", "velocity", "since", "found", "score", "suspect_frames", "first", "start")
-        return Past(*(state[name] for name in names))
-
-
-def suspect(estimate: Estimate, usual: Tensor) -> list[bool]:
-    """Templates that were not found, or look less like themselves than ``usual`` (R,): perhaps a wrong place."""
-    each = zip(estimate.status.tolist(), estimate.score.tolist(), usual.tolist(), strict=True)
-    return [status > Status.MAX_ITERATIONS or score < just_as_good(most) for status, score, most in each]
-
-
-def plausible(estimate: Estimate, start: Tensor, past: Past, radius: Tensor) -> Tensor:
-    """Places (R,) that were tracked to, look familiar, and lie about as close to the ``start`` (R, 3) as that does to
-    the last pose, if that has been tracked to as well: else nobody knows where it was going."""
-    near = ~strayed(estimate, start, past, radius, BASIN) & (past.found == 0)
-    return Status.good(estimate.status) & (estimate.score >= FAMILIAR * past.usual) & near
-
-
-def strayed(estimate: Estimate, start: Tensor, past: Past, radius: Tensor, most: float) -> Tensor:
-    """Which places (R,) lie over ``most`` px farther from the ``start`` (R, 3) than that does from the last pose."""
-    step, last = (pose_distance(start, pose, radius=radius) for pose in (estimate.pose, past.pose))
-    return step > most + last
-
-
-def disbelieved(
-    estimate: Estimate, suspects: list[bool], start: Tensor, past: Past, reference: Reference, frame: Tensor
-) -> Estimate:
-    """The ``estimate`` in a ``frame`` (..., H, W) in which those that are still suspect are lost if they have slid away
-    from where they were expected, or hardly look like themselves and are not in sight as a whole."""
-    index = (torch.tensor(suspects, device=start.device) & Status.good(estimate.status)).nonzero()[:, 0]
-    if len(index) == 0:
-        return estimate
-    slid = (estimate.origin == Origin.TRACKED) & strayed(estimate, start, past, reference.place.radius, SLID)
-    part = share_in_sight(reference.select(index), estimate.pose.detach()[index], frame) < WHOLE
-    part &= (estimate.score < RECOGNISED * past.usual)[index]
-    lost = torch.zeros_like(slid).index_put((index,), slid[index] | part)
-    return disproved(estimate, lost, Reason.ELSEWHERE)
 
 
 def from_rest(reference: Reference, image: Tensor, estimate: Estimate, past: Past, settings: Settings) -> Estimate:
@@ -119,38 +71,6 @@ def from_rest(reference: Reference, image: Tensor, estimate: Estimate, past: Pas
     stayed = pose_distance(found.pose, past.pose[index], radius=part.place.radius) <= AT_REST
     good = Status.good(found.status) & stayed & ~of_a_part(part, found, image)
     return estimate.put(index[good], found.at(good))
-
-
-def share_in_sight(reference: Reference, pose: Tensor, frame: Tensor) -> Tensor:
-    """What share (n,) of the templates' weight lies in a ``frame`` (..., H, W) at poses (n, 3)."""
-    shown = inside(reference.warps(pose), reference.grid.pixels, (frame.shape[-2], frame.shape[-1]))
-    share: Tensor = (reference.weight * shown).sum(1) / reference.weight.sum(1)
-    return share
-
-
-def of_a_part(reference: Reference, found: Estimate, frame: Tensor) -> Tensor:
-    """Which templates (n,) were ``found`` in a ``frame`` (..., H, W) by less than half of them, beyond its border or
-    not believed: something else may look like that part."""
-    return found.coverage * share_in_sight(reference, found.pose.detach(), frame) < LEAST_COVERAGE
-
-
-def familiar(found: Estimate, usual: Tensor) -> Tensor:
-    """Places (n,) that were found and look as the templates ``usual`` (n,) do."""
-    return within_margin(found.score, usual) & (found.status == Status.CONVERGED)
-
-
-def strained(reference: Reference, found: Estimate) -> Tensor:
-    """Places (n,) where templates were found whose residuals cling together as those of noise do not: what is there
-    is much like the template, but another thing."""
-    sigma = predicted_sigma(reference, reference.normal, found.residual_rms.to(found.pose).square())
-    usual, here = ((value * reference.place.lever).norm(dim=1) for value in (sigma, found.sigma))
-    much: Tensor = here > (STRAINED * usual).clamp(min=STRAIN)
-    return much
-
-
-def beats(found: Estimate, hand: Estimate) -> Tensor:
-    """Whether ``found`` places (n, ...) are clearly better than those at ``hand``: bool (n,)."""
-    return ~Status.good(hand.status) | ~within_margin(hand.score, found.score)
 
 
 class Recovery:
@@ -276,23 +196,58 @@ class Recovery:
         turned = torch.cat((best.pose[:, :2], unwrap(best.pose[:, 2:], pose[2])), -1)
         return estimate.put(index, best._replace(pose=turned))
 
-    def not_led_away(self, estimate: Estimate, start: Tensor, past: Past, which: Tensor | None = None) -> Estimate:
+    def not_misled(
+        self, image: Tensor, estimate: Estimate, start: Tensor, past: Past, which: Tensor | None = None
+    ) -> Estimate:
         """The ``estimate`` in which those templates ``which`` (R,), None for all, are lost that were tracked away from
         where they were expected, or to where nobody has seen them go, and that look-alikes may have led there."""
-        each = zip((estimate.pose - start).tolist(), past.since.tolist(), strict=True)
-        if all(since == 1 and math.hypot(x, y) + self.farthest * abs(q) <= BASIN for (x, y, q), since in each):
+        known = zip(past.since.tolist(), past.found.tolist(), strict=True)
+        each = zip((estimate.pose - start).tolist(), known, strict=True)
+        if all(k == (1, 0) and math.hypot(x, y) + self.farthest * abs(q) <= BASIN for (x, y, q), k in each):
             return estimate  # as in most frames, of which this is to be seen at once
         radius = self.reference.place.radius
-        far = pose_distance(estimate.pose, start, radius=radius) > BASIN
-        strays = Status.good(estimate.status) & (far | (past.since > 1))
+        away = gone_elsewhere(estimate, start, past, radius)
+        strays = Status.good(estimate.status) & (away | (past.since > 1))
         strays = strays if which is None else strays & which
         index = strays.nonzero()[:, 0]
         if len(index) == 0:
             return estimate
         expected = ~strayed(estimate, start, past, radius, BASIN)[index]
         part = (past.since[index] > 1) & of_a_part(self.reference.select(index), estimate.at(index), past.first)
-        lost = strays.index_put((index,), part | self.doubtful(estimate, index, start, past, expected))
-        return disproved(estimate, lost, Reason.AMBIGUOUS)
+        part |= (estimate.score < RECOGNISED * past.usual)[index]
+        seen = self.seen_whole(image, estimate, strays, past.usual)
+        lost = strays.index_put((index,), part | self.doubtful(seen, index, start, past, expected))
+        half = strays & ~lost & away & ((estimate.coverage < WHOLE) | ~within_margin(estimate.score, past.usual))
+        return disproved(estimate, lost | self.rivalled(image, estimate, half, past), Reason.AMBIGUOUS)
+
+    def seen_whole(self, image: Tensor, estimate: Estimate, which: Tensor, usual: Tensor) -> Estimate:
+        """The ``estimate`` in an ``image`` in which those templates ``which`` (R,) that are believed in part have
+        the score of the whole there, as look-alikes have theirs, if that is not far from the ``usual`` (R,) one."""
+        index = (which & (estimate.coverage < WHOLE)).nonzero()[:, 0]
+        if len(index) == 0:
+            return estimate
+        view = image.float() if len(image) == 1 else image[index].float()
+        score = detrended_zncc_at(self.reference.select(index), view, estimate.pose.detach()[index])
+        score = torch.where(score >= ALIKE * usual[index], score.to(estimate.score), estimate.score[index])
+        return estimate._replace(score=estimate.score.index_copy(0, index, score))
+
+    def rivalled(self, image: Tensor, estimate: Estimate, half: Tensor, past: Past) -> Tensor:
+        """Which of the templates ``half`` (R,) recognised in an ``image`` are recognised as well at another place near
+        the last one: a half of a template often looks like what is beside it."""
+        index = half.nonzero()[:, 0]
+        if len(index) == 0:
+            return half
+        surroundings, view = self.surroundings(index.tolist()), image.float()
+        self.budget.spend(surroundings.correlator.size, NEARBY_ALIGNED * len(index))
+        view, reference = view if len(view) == 1 else view[index], self.reference.select(index)
+        place, _ = surroundings.candidates(view, past.pose[index])
+        here, rivals = estimate.at(index), torch.zeros_like(index, dtype=torch.bool)
+        for k in range(place.shape[1]):
+            found = solve(reference, view, place[:, k].contiguous(), replace(self.settings, robust=True))
+            other = pose_distance(found.pose, here.pose, radius=reference.place.radius) > SUPPRESSION
+            known = Status.good(found.status) & (found.score >= RECOGNISED * past.usual[index])
+            rivals |= other & known & (found.coverage >= RIVAL * here.coverage)
+        return half.index_put((index,), rivals)
 
     def own(self, found: Estimate, before: Estimate, start: Tensor, past: Past) -> Estimate:
         """``found`` without the leaps from the ``start`` (R, 3) to where look-alikes of the templates may be as well:

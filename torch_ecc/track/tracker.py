@@ -25,12 +25,12 @@ from torch_ecc.search.locate import LEAST_VISIBLE, Located, Locator
 from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, check_prediction, skipped
 from torch_ecc.track.budget import DOUBTED, Budget, income
 from torch_ecc.track.crowd import Crowd
+from torch_ecc.track.doubt import Past, disbelieved, hopeful, suspect
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told, with_new_parts
 from torch_ecc.track.light import told_of_light
 from torch_ecc.track.look import Look
-from torch_ecc.track.lost import hopeful
 from torch_ecc.track.max_step import MaxStep
-from torch_ecc.track.recover import Past, Recovery, disbelieved, from_rest, suspect
+from torch_ecc.track.recover import Recovery, from_rest
 from torch_ecc.track.sensor import dead_in, kept, shown
 from torch_ecc.track.shutter import Shutter
 from torch_ecc.track.textureless import warn_of_textureless
@@ -328,7 +328,7 @@ class Tracker(nn.Module):
         estimate = self._past_marks(view, estimate, start, odd, None if strange is None else ~strange)
         estimate, past = self.max_step.kept(estimate, state), Past.of(state)
         if self.search:
-            estimate = self._recovery.not_led_away(estimate, start, past)
+            estimate = self._recovery.not_misled(view, estimate, start, past)
         suspects = suspect(estimate, state["score"])
         if doubted := hopeful(suspects, self._recovery.hopeless, estimate):
             self._recovery.budget.earn(self.income * DOUBTED * doubted / len(start))
@@ -339,7 +339,7 @@ class Tracker(nn.Module):
             if strange is not None:  # what is strange is searched for first: it has no marks in most frames
                 strange &= start.new_tensor(suspect(estimate, state["score"])) > 0
                 estimate = self.max_step.kept(self._past_marks(view, estimate, start, odd, strange), state)
-                estimate = self._recovery.not_led_away(estimate, start, past, strange) if self.search else estimate
+                estimate = self._recovery.not_misled(view, estimate, start, past, strange) if self.search else estimate
             if self.search:
                 estimate = disbelieved(estimate, suspect(estimate, state["score"]), start, past, reference, images[0])
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
