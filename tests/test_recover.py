@@ -13,6 +13,7 @@ import torch
 
 import torch_ecc as te
 from torch_ecc import Origin, Status, Tracker
+from torch_ecc.core import robust
 from torch_ecc.core.pose import compose
 from torch_ecc.io import open_frames
 from torch_ecc.sim import micrograph
@@ -604,3 +605,22 @@ def test_half_of_a_template_does_not_lead_to_what_is_beside_it(hidden):
     wrong = (off > 0.1) & (off > 5 * track.sigma[..., :2].amax(-1))
     assert not bool((wrong & (track.status == Status.CONVERGED)).any())
     assert track.ok.double().mean() > (0.2 if hidden else 0.99)
+
+
+def test_what_has_jumped_is_searched_for_before_it_is_tried_what_covers_it(monkeypatch):
+    """What is covered is not searched for, what is hidden is neither found nor recognised."""
+    done: list[str] = []
+    for module, name in ((robust, "best_trial"), (Recovery, "search_near")):
+        work = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, work=work, name=name: (done.append(name), work(*a))[1])
+    stack = still((0, 0, 0), (20, -18, 4), (1, 0, 0))
+    cover = noisy(PlaneWaves.random(seed=6).render(torch.zeros(1, 3).double(), FRAME)[0, 0].numpy(), RNG)
+    part, whole = (torch.where(torch.from_numpy(where), cover, stack[2]) for where in (X > 175, X > 100))
+    for frame, made, status, origin in (
+        (stack[1], {"search_near"}, Status.CONVERGED, Origin.NEARBY),
+        (part, {"best_trial"}, Status.CONVERGED, Origin.TRACKED),
+        (whole, {"search_near", "best_trial"}, Status.LOST, Origin.TRACKED),
+    ):
+        done.clear()
+        estimate = Tracker(stack[0], [(160.0, 120.0)], 61)(frame)
+        assert (set(done), estimate.status, estimate.origin) == (made, status, origin)

@@ -29,8 +29,9 @@ if TYPE_CHECKING:  # what type checkers and editors read; the same places as bel
     from torch_ecc.search.locate import Located, Locator, locate
     from torch_ecc.track.frame_mask import suggest_frame_mask
     from torch_ecc.track.own_mask import suggest_mask
+    from torch_ecc.track.sequence import SequenceError
     from torch_ecc.track.stabilise import stabilise
-    from torch_ecc.track.tracker import SequenceError, Tracker
+    from torch_ecc.track.tracker import Tracker
 
 __version__ = "0.1.0"
 
@@ -53,7 +54,8 @@ _PLACES = {
     "track.frame_mask": ["suggest_frame_mask"],
     "track.own_mask": ["suggest_mask"],
     "track.stabilise": ["stabilise"],
-    "track.tracker": ["SequenceError", "Tracker"],
+    "track.sequence": ["SequenceError"],
+    "track.tracker": ["Tracker"],
 }
 
 __all__ = [

@@ -41,6 +41,8 @@ WORST = 1e30  # excess of what does not fit at all
 FITS = 1.4  # median excess: nothing else is tried
 BRIGHTER = 2.0  # times the gain of least squares
 RECOGNISED = 0.9  # of the usual score: least squares that reaches it has found the template
+FAMILIAR = 0.8  # of the usual score: what has less where it was tracked to may be something else
+THERE = 0.5  # gain of most blocks: what is covered has about the gain that it always has, what has jumped has none
 FARTHEST = 8.0  # px, of the farthest pixel: what is seen in part has not moved more
 SETTLED = 0.01  # of the template's weight: trust changes no more
 
@@ -55,12 +57,14 @@ class Scale(NamedTuple):
 class Memory(NamedTuple):
     """What is known of B templates from the frames before: their usual ``score`` (B,), and the ``trust`` (B, blocks)
     that there was in them in the last one; and in how many they ``answered`` (B,) a push, see ``pushed``.
-    ``put_off``: templates that are in doubt are only named, not solved again."""
+    ``put_off``: templates that are in doubt are only named, not solved again; ``put_off_gone``: only those that are
+    ``gone``, where the host can see them."""
 
     score: Tensor
     trust: Tensor
     answered: Tensor
     put_off: bool = False
+    put_off_gone: bool = False
 
     @staticmethod
     def none(reference: Reference) -> Memory:
@@ -134,11 +138,18 @@ def solve(
         if not doubtful.any():
             return found._replace(odd=odd)
         doubted, plain, uneven = doubted.at(doubtful), part_of(plain, doubtful), uneven[doubtful]
-        doubtful = doubtful[doubtful]
+        if memory.put_off_gone and (left := gone(doubted, start, plain)).any():
+            named = torch.zeros_like(odd).index_put((doubted.which,), left)
+            found = found._replace(odd=odd, doubtful=named)
+            if left.all():
+                return found
+            doubted, plain, uneven = doubted.at(~left), part_of(plain, ~left), uneven[~left]
+        doubtful = torch.ones_like(uneven)
     again = solved_again(doubted if on_cpu else doubted._replace(asked=doubtful), start, plain, uneven)
     answer = chosen(doubtful, again, plain)
-    answer = each(lambda old, new: old.index_copy(0, doubted.which, new), found._replace(trust=whole(found)), answer)
-    return answer._replace(odd=odd)
+    before = found._replace(trust=whole(found), odd=None, doubtful=None)
+    answer = each(lambda old, new: old.index_copy(0, doubted.which, new), before, answer)
+    return answer._replace(odd=odd, doubtful=found.doubtful)
 
 
 def unusual(reference: Reference, found: Solution, settings: Settings, usual: Tensor) -> Tensor | None:
@@ -156,6 +167,16 @@ def unusual(reference: Reference, found: Solution, settings: Settings, usual: Te
     expected = torch.maximum(usual_variance(*known), least_noise(reference, settings)[:, 0])
     odd = ~(worst <= OUTLIER * expected)  # NaN is unusual
     return None if on_cpu and not odd.any() else odd
+
+
+def gone(doubted: Doubted, start: Tensor, plain: Solution) -> Tensor:
+    """Which templates (n,), seen whole in the last frame, least squares does not find, and most of whose blocks do not
+    see them at the ``start`` (B, 3), whatever may cover the others: they have jumped."""
+    left = (correlation(plain.normal, plain.total) < FAMILIAR * doubted.usual) & (doubted.last == 1).all(1)
+    if not left.any():
+        return left
+    look = doubted.solve(start, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
+    return left & (median_fit(look.sums, doubted.blocks)[1][:, 0] < THERE)
 
 
 def has_outliers(doubted: Doubted, found: Solution) -> Tensor:

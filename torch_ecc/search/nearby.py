@@ -30,7 +30,7 @@ SPACINGS = (8, 4, 2, 1)  # px between the pixels that are compared
 LEAST_DENSITY = 2.0  # texture that is left, over what white noise of the same contrast would leave
 LARGEST_KERNEL = 49  # pixels across: they tell enough
 CANDIDATES = 5  # places per template that are brought to the answer: those with
-SCORE_MARGIN = 0.25  # s >= s_best - this, the nearest first
+SCORE_MARGIN, LEAST_SCORE = 0.25, 0.2  # s >= max(s_best - margin, least), the nearest first
 FARTHER_MARGIN = (0.9, 0.002)  # (a, b): a farther place of score s is better if 1 - s < a (1 - s_nearer) - b
 
 Allowed = Callable[[Tensor], Tensor]  # which of places (..., 3) may be the template's, bool (...)
@@ -77,7 +77,8 @@ class Nearby(NamedTuple):
             score = torch.where(allowed(place), score, -1.0)
         step = place - pose[:, None]
         distance = torch.cat((step[..., :2], step[..., 2:] * self.radius[:, None, None]), -1).norm(dim=-1)
-        distance = torch.where(score >= score.amax(-1, keepdim=True) - SCORE_MARGIN, distance, torch.inf)
+        least = (score.amax(-1, keepdim=True) - SCORE_MARGIN).clamp(min=LEAST_SCORE)
+        distance = torch.where(score >= least, distance, torch.inf)
         distance, order = distance.sort(-1)
         place = place.gather(1, order[..., None].expand_as(place))
         best = solve(reference, image, place[:, 0], settings)

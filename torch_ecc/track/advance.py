@@ -50,17 +50,18 @@ class Remembering:
     """How templates are found in an ``image``, from poses (R, 3) on, with what is known of them in a ``state``; what of
     them is believed where there is a pose, is what the next look begins with.
 
-    ``put_off``: those that must be solved again are only named. ``odd``: which (R,) have blocks with more left than any
+    ``put_off``, ``put_off_gone``: those that must be solved again, or of them those that are gone, are only named, see
+    ``Memory``. ``odd``: which (R,) have blocks with more left than any
     noise leaves, and ``doubtful``: which must be solved again, None if it is known that none has, or must."""
 
-    def __init__(self, state: State, image: Tensor, settings: Settings, put_off: bool = False) -> None:
+    def __init__(self, state: State, image: Tensor, settings: Settings, *put_off: bool) -> None:
         self.state, self.image, self.settings, self.put_off = state, image, settings, put_off
         self.odd: Tensor | None = None
         self.doubtful: Tensor | None = None
 
     def __call__(self, reference: Reference, pose: Tensor) -> Estimate:
         state = self.state
-        memory = Memory(state["score"], state["trust"], state["answered"], self.put_off)
+        memory = Memory(state["score"], state["trust"], state["answered"], *self.put_off)
         estimate, found = solve_again(reference, self.image, pose, self.settings, state["start"], memory)
         self.odd, self.doubtful = found.odd, found.doubtful
         if found.trust is None:

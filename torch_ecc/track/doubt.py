@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.reference import Reference
-from torch_ecc.core.robust import RECOGNISED
+from torch_ecc.core.robust import FAMILIAR, RECOGNISED
 from torch_ecc.core.sampling import inside
 from torch_ecc.core.verdict import LEAST_COVERAGE, just_as_good, predicted_sigma, within_margin
 from torch_ecc.search.locate import pose_distance
-from torch_ecc.track.lost import FAMILIAR, disproved
+from torch_ecc.track.lost import disproved
 
 BASIN = 4.0  # px at the farthest pixel beyond the last step: a place that was tracked to so near is plausible
 SLID = 16.0  # px beyond the last step: where something else was tracked, if it does not look as usual either

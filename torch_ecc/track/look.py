@@ -29,7 +29,7 @@ from torch_ecc.track.shutter import Shutter
 WARM = 3  # looks before the one that is recorded: constants are made, kernels compiled and loaded
 
 # Start (R, 3), what was found, which (R,) have blocks with more left than any noise leaves, None if none has, and which
-# must be solved again, None if all are that must be.
+# must be solved again, None if all are that must be: those that are gone, if these are to be searched for first.
 Result = tuple[Tensor, Estimate, Tensor | None, Tensor | None]
 
 
@@ -46,18 +46,20 @@ class Look:
     shown: Tensor | None
     graphs: dict[bool, Graph] = field(default_factory=dict, init=False)  # one, and another for what was put off
 
-    def __call__(self, image: Tensor, images: list[Tensor]) -> tuple[Tensor, Estimate, Tensor | None]:
+    def __call__(self, image: Tensor, images: list[Tensor], search_first: bool = False) -> Result:
         """At an ``image`` (1 or R, 1, H, W), as ``core.frame.as_image`` has it; ``images`` holds it without gradients
-        and grows to as many levels as there are."""
+        and grows to as many levels as there are. ``search_first``: what is gone is only named, if nothing else knows
+        where it may be."""
+        alone = len(self.references) == 1 and self.shutter.line == 0
         if len(self.references) > 1 or not self.recordable(image):
-            return self.made(image, images)[:3]
+            return self.made(image, images, False, search_first and alone)
         before = [part.clone() for part in self.kept]
         result = self.graph(image, put_off=self.shutter.line == 0)(image)
         if result[3] is not None and bool(result[3].any()):
             for part, was in zip(self.kept, before, strict=True):
                 part.copy_(was)
             result = self.graph(image, put_off=False)(image)
-        return result[:3]
+        return *result[:3], None
 
     @property
     def kept(self) -> list[Tensor]:
@@ -76,7 +78,7 @@ class Look:
             return False
         return not implicit.wanted(self.references[0], image, self.state["pose"])
 
-    def made(self, image: Tensor, images: list[Tensor], put_off: bool = False) -> Result:
+    def made(self, image: Tensor, images: list[Tensor], *put_off: bool) -> Result:
         """Coarse to fine."""
         pose = self.state["pose"]
         start = there = ahead(pose, self.state["velocity"]) if self.moving else pose
@@ -84,7 +86,7 @@ class Look:
             image = filled(image.float(), self.shown)
             images[:] = image_pyramid(image.detach(), len(self.references))
             there = coarse_to_fine(self.references, images, start, self.settings.max_iterations)
-        look = Remembering(self.state, image, self.settings, put_off)
+        look = Remembering(self.state, image, self.settings, *put_off)
         estimate = self.shutter.solve(look, self.references[0], there, self.state, self.settings.tolerance)
         return start, estimate, look.odd, look.doubtful
 

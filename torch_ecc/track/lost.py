@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Reason, Status
+from torch_ecc.core.robust import FAMILIAR
 from torch_ecc.core.verdict import unknown
-
-FAMILIAR = 0.8  # of its usual score: what has less where it was tracked to is searched for in the whole frame
 
 
 def disproved(estimate: Estimate, lost: Tensor, reason: Reason) -> Estimate:

@@ -20,6 +20,7 @@ from torch_ecc.core.estimate import Estimate, Origin, Reason, Status
 from torch_ecc.core.pose import unwrap
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import RECOGNISED, Memory
+from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
 from torch_ecc.core.verdict import expected_score, within_margin
@@ -147,6 +148,13 @@ class Recovery:
                 due.append(r)
         return self.budget.in_turn(due, AT_ONCE)[:NEARBY_AT_ONCE]
 
+    def comes_first(self, since: Tensor) -> bool:
+        """Whether templates that are gone are searched for before it is tried whether something covers them: if all
+        were there in the last frame, ``since`` (R,) is 1, and can be; where the host sees it."""
+        return (
+            is_cpu(since.device) and max(since.tolist()) == 1 and not any(self.hopeless) and self.budget.left(RESERVE)
+        )
+
     def search_near(self, image: Tensor, estimate: Estimate, start: Tensor, past: Past, due: list[int]) -> Estimate:
         """Second attempt for the templates ``due``: around their ``start`` (R, 3)."""
         index = torch.tensor(due, device=start.device)
@@ -208,7 +216,7 @@ class Recovery:
         radius = self.reference.place.radius
         away = gone_elsewhere(estimate, start, past, radius)
         strays = Status.good(estimate.status) & (away | (past.since > 1))
-        strays = strays if which is None else strays & which
+        strays &= (estimate.origin == Origin.TRACKED) if which is None else which
         index = strays.nonzero()[:, 0]
         if len(index) == 0:
             return estimate

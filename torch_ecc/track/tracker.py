@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torch_ecc.core.ambient import lasting, plain, threads_for, unrecorded
 from torch_ecc.core.criteria import Criterion, make_criterion, named
-from torch_ecc.core.estimate import Estimate, Track
+from torch_ecc.core.estimate import Estimate, Origin, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_as_first, require_tensor
 from torch_ecc.core.native.engine import DEGREE, code_of
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
@@ -26,25 +26,19 @@ from torch_ecc.track.advance import advanced, advanced_in_doubt, beginning, chec
 from torch_ecc.track.budget import DOUBTED, Budget, income
 from torch_ecc.track.crowd import Crowd
 from torch_ecc.track.doubt import Past, disbelieved, hopeful, suspect
+from torch_ecc.track.gone import searched_first
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told, with_new_parts
 from torch_ecc.track.light import told_of_light
 from torch_ecc.track.look import Look
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Recovery, from_rest
 from torch_ecc.track.sensor import dead_in, kept, shown
+from torch_ecc.track.sequence import tracked
 from torch_ecc.track.shutter import Shutter
 from torch_ecc.track.textureless import warn_of_textureless
 from torch_ecc.track.watch import Marks, Watch
 
 DERIVED = ("references", "_unmarked", "_look", "_marks", "_recovery", "_crowd", "_teacher", "_version")  # of the state
-
-
-class SequenceError(ValueError):
-    """A frame of a sequence was refused; ``track`` holds the frames before it (None if it was the first)."""
-
-    def __init__(self, message: str, track: Track | None) -> None:
-        super().__init__(message)
-        self.track = track
 
 
 class Tracker(nn.Module):
@@ -323,18 +317,26 @@ class Tracker(nn.Module):
         image = image if self.dead is None else self.dead.repair(image)
         images = [image.detach()]
         self._recovery.budget.earn(self.income)
-        start, estimate, odd = self._look(image, images)
-        view, strange = images[0], None if odd is None else start.new_tensor(suspect(estimate, state["score"])) > 0
+        first = self.search and not image.requires_grad and self._recovery.comes_first(state["since"])
+        start, estimate, odd, gone = self._look(image, images, first)
+        view, past = images[0], Past.of(state)
+        if gone is not None and odd is not None:
+            doubted = sum(suspect(estimate, state["score"]))
+            self._recovery.budget.earn(self.income * DOUBTED * doubted / len(start))
+            estimate = self.max_step.kept(estimate, state)
+            estimate = searched_first(self._recovery, images, estimate, start, gone, state)
+            odd = odd & ~(gone & (estimate.origin != Origin.TRACKED))
+        strange = None if odd is None else start.new_tensor(suspect(estimate, state["score"])) > 0
         estimate = self._past_marks(view, estimate, start, odd, None if strange is None else ~strange)
-        estimate, past = self.max_step.kept(estimate, state), Past.of(state)
+        estimate = self.max_step.kept(estimate, state)
         if self.search:
             estimate = self._recovery.not_misled(view, estimate, start, past)
         suspects = suspect(estimate, state["score"])
         if doubted := hopeful(suspects, self._recovery.hopeless, estimate):
-            self._recovery.budget.earn(self.income * DOUBTED * doubted / len(start))
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
             estimate = self.max_step.kept(from_rest(reference, images[0], estimate, past, self.settings), state)
-            if self.search:
+            if self.search and gone is None:
+                self._recovery.budget.earn(self.income * DOUBTED * doubted / len(start))
                 estimate = self.max_step.kept(self._recovery(images, estimate, start, past), state)
             if strange is not None:  # what is strange is searched for first: it has no marks in most frames
                 strange &= start.new_tensor(suspect(estimate, state["score"])) > 0
@@ -343,7 +345,7 @@ class Tracker(nn.Module):
             if self.search:
                 estimate = disbelieved(estimate, suspect(estimate, state["score"]), start, past, reference, images[0])
         apart = estimate if self._crowd is None else self._crowd.apart(estimate, start)
-        if not any(suspects) and apart is estimate:
+        if gone is None and not any(suspects) and apart is estimate:
             return self._learned(image, advanced(state, estimate), [False] * len(start))
         suspects = suspect(apart, state["score"])
         apart = told_of_light(apart, images[0], state, self.references[0].grid.sides)
@@ -383,18 +385,4 @@ class Tracker(nn.Module):
         ``stop_at_damage`` it ends by SequenceError, with the track so far, and so it does where ``frames`` itself
         raises a ValueError or brings something else than tensors.
         """
-        estimates: list[Estimate] = []
-        try:
-            for frame in frames:
-                try:
-                    estimates.append(self.track(frame))  # type: ignore[arg-type]  # None is refused
-                except ValueError:
-                    if stop_at_damage or not (frame is None or isinstance(frame, Tensor)):
-                        raise
-                    estimates.append(self.skip())
-        except ValueError as error:
-            done = Track.stack(estimates) if estimates else None
-            raise SequenceError(f"track_sequence: frame {len(estimates)}: {error}", done) from error
-        if not estimates:
-            raise ValueError("track_sequence: frames must hold at least one frame, got none")
-        return Track.stack(estimates)
+        return tracked(self.track, self.skip, frames, stop_at_damage)
