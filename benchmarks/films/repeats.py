@@ -11,7 +11,7 @@ from torch import Tensor
 from films.covers import covered
 from films.shot import Film, Shot, frames, sense
 from torch_ecc.core.pose import compose
-from torch_ecc.sim import Occluder, Pads
+from torch_ecc.sim import Occluder, Pads, micrograph
 from torch_ecc.sim.scene.layout import Rectangle
 
 BASE = 70.0  # grey levels between the parts
@@ -131,6 +131,31 @@ def crossing(seed: int, beside: float, speed: float, turn: float) -> Film:
     return first._replace(centers=torch.cat((first.centers, second.centers)), **both)
 
 
+def leaps(hidden: str, count: int) -> Iterator[Film]:
+    """24 patches of 31 px on a micrograph, whose parts repeat every 30 px, that leaps by up to 4, 8 or 13 px in x and y
+    in every frame; from the third one on part of the picture is ``hidden``, see HIDDEN."""
+    x, y = (40.0 * torch.arange(1, n + 1, dtype=torch.float64) + 20 for n in (6, 4))
+    centers = torch.cartesian_prod(x, y)
+    for seed in range(count):
+        for farthest in (4.0, 8.0, 13.0):
+            u = torch.rand(21, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+            step = (2 * u - 1) * u.new_tensor((farthest, farthest, 0.0)) * (frames(21) > 0)[:, None]
+            shot = Shot(micrograph(), seed, step + step.new_tensor((180.0, 130.0, 0.0)), 31, (260, 360))
+            mask = HIDDEN[hidden](torch.arange(360)).expand(shot.clean.shape)
+            mask = mask & (frames(21) > 2)[:, None, None, None]
+            truth = torch.nn.functional.pad(centers, (0, 1)) + step[1:, None]
+            open_ = torch.nn.functional.avg_pool2d((~mask[1:]).double(), 31, 1)[:, 0]  # of the square around each pixel
+            at = (truth[..., :2].round().long() - 15).unbind(-1)
+            seen = open_[torch.arange(20)[:, None], at[1], at[0]]
+            shown = sense(torch.where(mask, 90.0, shot.clean), seed)
+            yield Film(shown, centers, 31, truth, seen, math.nan * truth, 20)
+
+
+HIDDEN: dict[str, Callable[[Tensor], Tensor]] = {  # columns of a picture
+    "open": lambda x: x < 0,
+    "half hidden": lambda x: x < 150,
+    "behind bars": lambda x: x % 46 < 10,
+}
 CROSSING = 40  # frames
 
 
