@@ -222,16 +222,18 @@ class Recovery:
             return estimate
         expected = ~strayed(estimate, start, past, radius, BASIN)[index]
         part = (past.since[index] > 1) & of_a_part(self.reference.select(index), estimate.at(index), past.first)
-        part |= (estimate.score < RECOGNISED * past.usual)[index]
         seen = self.seen_whole(image, estimate, strays, past.usual)
+        part |= (seen.score.maximum(estimate.score) < RECOGNISED * past.usual)[index]
         lost = strays.index_put((index,), part | self.doubtful(seen, index, start, past, expected))
         half = strays & ~lost & away & ((estimate.coverage < WHOLE) | ~within_margin(estimate.score, past.usual))
         return disproved(estimate, lost | self.rivalled(image, estimate, half, past), Reason.AMBIGUOUS)
 
     def seen_whole(self, image: Tensor, estimate: Estimate, which: Tensor, usual: Tensor) -> Estimate:
-        """The ``estimate`` in an ``image`` in which those templates ``which`` (R,) that are believed in part have
-        the score of the whole there, as look-alikes have theirs, if that is not far from the ``usual`` (R,) one."""
-        index = (which & (estimate.coverage < WHOLE)).nonzero()[:, 0]
+        """The ``estimate`` in an ``image`` in which those of the templates ``which`` (R,) that are believed in part, or
+        less than is ``usual`` (R,), have the score of the whole off the plane of light, as look-alikes have theirs, if
+        it is not far from that."""
+        doubted = (estimate.coverage < WHOLE) | (estimate.score < RECOGNISED * usual)
+        index = (which & doubted).nonzero()[:, 0]
         if len(index) == 0:
             return estimate
         view = image.float() if len(image) == 1 else image[index].float()
