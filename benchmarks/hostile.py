@@ -145,7 +145,7 @@ def worlds(count: int, data: Path | None) -> dict[str, Callable[[], Iterable[Fil
             own[f"{parts} parts, {event}"] = partial(repeats.arrays, event, spread, count)
     own["equal parts crossing"] = partial(repeats.crossings, count)
     own |= {
-        f"small patches leap, {hidden}": partial(repeats.leaps, hidden, -(-count // 10)) for hidden in repeats.HIDDEN
+        f"small patches jump, {hidden}": partial(repeats.leaps, hidden, -(-count // 10)) for hidden in repeats.HIDDEN
     }
     for what, black in (("clipped", 0.0), ("noisy", 40.0)):
         for size in (61, 121):
