@@ -20,15 +20,16 @@ CORRELATION = 4  # times the pixels of a spectrum, for every angle
 
 class Budget:
     """Of frames of ``pixels`` with templates of ``textured`` pixels in all. ``credit`` () and whose ``turn`` () it is
-    if many are lost are parts of a tracker's state, written in place."""
+    if many are lost are parts of a tracker's state, written in place; ``income`` per frame, see there."""
 
-    def __init__(self, credit: Tensor, turn: Tensor, pixels: int, textured: int) -> None:
-        self.credit, self.turn, self.frame = credit, turn, max(pixels + SOLVE * textured, LEAST_FRAME)
+    def __init__(self, credit: Tensor, turn: Tensor, pixels: int, textured: int, income: float) -> None:
+        self.credit, self.turn, self.income = credit, turn, income
+        self.frame = max(pixels + SOLVE * textured, LEAST_FRAME)
 
-    def earn(self, income: float) -> None:
-        """Another frame's, if there is not all the credit that there can be."""
+    def earn(self, frames: float = 1.0) -> None:
+        """What so many ``frames`` bring, if there is not all the credit that there can be."""
         if not is_cpu(self.credit.device) or float(self.credit) < BURST:
-            self.credit.add_(income)
+            self.credit.add_(self.income * frames)
 
     def left(self, reserve: float = 0.0) -> bool:
         """Whether there is any credit, which is BURST at most, beyond a ``reserve``."""

@@ -6,7 +6,6 @@ A trial of the robust solve (``core.robust``) costs as much as a search near, an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -43,8 +42,8 @@ def covered(recovery: Recovery, image: Tensor, start: Tensor, index: Tensor, sta
     """Templates at ``index`` (n,) of a ``state``, solved robustly; what of them is believed goes into it."""
     part = {name: state[name][index] for name in ("score", "trust", "answered", "start", "fixed", "heed")}
     view, memory = image if len(image) == 1 else image[index], Memory(part["score"], part["trust"], part["answered"])
-    reference, settings = recovery.reference.select(index), replace(recovery.settings, robust=True)
-    estimate, found = solve_again(reference, view, start[index], settings, part["start"], memory)
+    reference = recovery.reference.select(index)
+    estimate, found = solve_again(reference, view, start[index], recovery.as_tracked, part["start"], memory)
     if found.trust is not None:
         state["trust"].index_copy_(0, index, torch.where(estimate.ok[:, None], found.trust, 1.0))
     return held(estimate, found, reference, part)

@@ -26,7 +26,7 @@ from torch_ecc.core.sight import filled
 from torch_ecc.core.verdict import expected_score, within_margin
 from torch_ecc.search.locate import LEAST_VISIBLE, SUPPRESSION, Locator, detrended_zncc_at, image_pyramid, pose_distance
 from torch_ecc.search.look_alikes import NEARER, REACH, RIVAL, LookAlikes, look_alikes_anywhere, look_alikes_near
-from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, Allowed, Nearby
+from torch_ecc.search.nearby import ANGLE_STEP, HALF_WIDTH, LARGEST_ANGLE, LEAST_SCORE, Allowed, Nearby
 from torch_ecc.track.budget import RESERVE, Budget
 from torch_ecc.track.doubt import (
     BASIN,
@@ -81,6 +81,7 @@ class Recovery:
     def __init__(self, reference: Reference, settings: Settings, budget: Budget, max_step: MaxStep) -> None:
         # A wrong place must not be made right by leaving out what does not fit.
         self.reference, self.settings, self.max_step = reference, replace(settings, robust=False), max_step
+        self.as_tracked = settings
         self.budget, self.farthest = budget, float(reference.place.radius.max())
         self.expected = expected_score(reference)
         self.window, self.flattest = least_contrast(reference)
@@ -226,7 +227,10 @@ class Recovery:
         part |= (seen.score.maximum(estimate.score) < RECOGNISED * past.usual)[index]
         lost = strays.index_put((index,), part | self.doubtful(seen, index, start, past, expected))
         half = strays & ~lost & away & ((estimate.coverage < WHOLE) | ~within_margin(estimate.score, past.usual))
-        return disproved(estimate, lost | self.rivalled(image, estimate, half, past), Reason.AMBIGUOUS)
+        estimate = disproved(estimate, lost, Reason.AMBIGUOUS)
+        if not self.budget.left():
+            return disproved(estimate, half, Reason.WAITING)
+        return disproved(estimate, self.rivalled(image, estimate, half, past), Reason.AMBIGUOUS)
 
     def seen_whole(self, image: Tensor, estimate: Estimate, which: Tensor, usual: Tensor) -> Estimate:
         """The ``estimate`` in an ``image`` in which those of the templates ``which`` (R,) that are believed in part, or
@@ -249,14 +253,20 @@ class Recovery:
             return half
         surroundings, view = self.surroundings(index.tolist()), image.float()
         self.budget.spend(surroundings.correlator.size, NEARBY_ALIGNED * len(index))
-        view, reference = view if len(view) == 1 else view[index], self.reference.select(index)
-        place, _ = surroundings.candidates(view, past.pose[index])
-        here, rivals = estimate.at(index), torch.zeros_like(index, dtype=torch.bool)
+        place, score = surroundings.candidates(view if len(view) == 1 else view[index], past.pose[index])
+        radius, here = self.reference.place.radius[index], estimate.pose.detach()[index]
+        beside = (pose_distance(place, here[:, None], radius=radius[:, None]) > SUPPRESSION) & (score >= LEAST_SCORE)
+        rivals = torch.zeros_like(index, dtype=torch.bool)
         for k in range(place.shape[1]):
-            found = solve(reference, view, place[:, k].contiguous(), replace(self.settings, robust=True))
-            other = pose_distance(found.pose, here.pose, radius=reference.place.radius) > SUPPRESSION
-            known = Status.good(found.status) & (found.score >= RECOGNISED * past.usual[index])
-            rivals |= other & known & (found.coverage >= RIVAL * here.coverage)
+            some = (beside[:, k] & ~rivals).nonzero()[:, 0]
+            if len(some) == 0:
+                continue
+            which = index[some]
+            seen = view if len(view) == 1 else view[which]
+            found = solve(self.reference.select(which), seen, place[some, k], self.as_tracked)
+            other = pose_distance(found.pose, here[some], radius=radius[some]) > SUPPRESSION
+            known = Status.good(found.status) & (found.score >= RECOGNISED * past.usual[which])
+            rivals[some] = other & known & (found.coverage >= RIVAL * estimate.coverage[which])
         return half.index_put((index,), rivals)
 
     def own(self, found: Estimate, before: Estimate, start: Tensor, past: Past) -> Estimate:

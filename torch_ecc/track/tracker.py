@@ -207,7 +207,8 @@ class Tracker(nn.Module):
         self._unmarked, first, marks = references, seen_through(references[0], self.frame_mask), self.finds_marks
         self._marks = Marks.of(first, self.settings, self._buffers, marks) if self.watches else None
         self.references = [self._marks.reference if self._marks else first, *references[1:]]
-        budget = Budget(self.credit, self.turn, math.prod(self.frame_shape), self.template.numel())
+        pixels, textured = math.prod(self.frame_shape), self.template.numel()
+        budget = Budget(self.credit, self.turn, pixels, textured, self.income)
         self._recovery = Recovery(self.references[0], self.settings, budget, self.max_step)
         moving = self.prediction == "velocity"
         self._look = Look(self.references, self.settings, self.shutter, self._buffers, moving, self.frame_mask)
@@ -316,13 +317,13 @@ class Tracker(nn.Module):
             self._use(self._prepared(self._buffers))
         image = image if self.dead is None else self.dead.repair(image)
         images = [image.detach()]
-        self._recovery.budget.earn(self.income)
+        self._recovery.budget.earn()
         first = self.search and not image.requires_grad and self._recovery.comes_first(state["since"])
         start, estimate, odd, gone = self._look(image, images, first)
         view, past = images[0], Past.of(state)
         if gone is not None and odd is not None:
             doubted = sum(suspect(estimate, state["score"]))
-            self._recovery.budget.earn(self.income * DOUBTED * doubted / len(start))
+            self._recovery.budget.earn(DOUBTED * doubted / len(start))
             estimate = self.max_step.kept(estimate, state)
             estimate = searched_first(self._recovery, images, estimate, start, gone, state)
             odd = odd & ~(gone & (estimate.origin != Origin.TRACKED))
@@ -336,7 +337,7 @@ class Tracker(nn.Module):
             reference = self.references[0].distorted(self.shutter.distortion(past.pose, state))
             estimate = self.max_step.kept(from_rest(reference, images[0], estimate, past, self.settings), state)
             if self.search and gone is None:
-                self._recovery.budget.earn(self.income * DOUBTED * doubted / len(start))
+                self._recovery.budget.earn(DOUBTED * doubted / len(start))
                 estimate = self.max_step.kept(self._recovery(images, estimate, start, past), state)
             if strange is not None:  # what is strange is searched for first: it has no marks in most frames
                 strange &= start.new_tensor(suspect(estimate, state["score"])) > 0
