@@ -2,7 +2,8 @@
 
 Prints the largest errors on mechanism_video, pixel_shift, pyvale_rigid and rotation_full at default settings, how far a
 jump may go with and without pyramid and search, and of 1,000 frames of each, there and back over and over: how many are
-found, by how much what is CONVERGED differs from one visit of a frame to the next, and the median and longest time.
+found, by how much what is CONVERGED differs from one visit of a frame to the next, and the median and longest time of
+a frame, of some runs the shortest.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from torch_ecc.io import open_frames
 
 console = Console(width=120)
 VISITS = 1000  # frames, there and back
+RUNS = 3  # of the same frames: the shortest time of each is its own, and not that of what else the machine did
 
 
 def facts(folder: Path) -> dict:
@@ -103,18 +105,21 @@ def there_and_back(folder: Path, center: tuple[float, float] | None, size: int) 
     still = folder / "ref.png"
     shown = ([reference(folder)] if still.exists() else []) + frames(folder)
     h, w = shown[0].shape[-2:]
-    tracker = Tracker(shown[0], [center or (w / 2, h / 2)], size)
-    visits: dict[int, list[torch.Tensor]] = {}
-    found, times = 0, []
-    for k in islice(cycle([*range(1, len(shown)), *range(len(shown) - 2, -1, -1)]), VISITS):
-        begin = time.process_time()
-        estimate = tracker(shown[k])
-        times.append(1e3 * (time.process_time() - begin))
-        found += bool(estimate.ok)
-        if estimate.status == Status.CONVERGED:
-            visits.setdefault(k, []).append(estimate.pose[0, :2])
+    order = list(islice(cycle([*range(1, len(shown)), *range(len(shown) - 2, -1, -1)]), VISITS))
+    shortest = [math.inf] * VISITS
+    for _ in range(RUNS):
+        tracker = Tracker(shown[0], [center or (w / 2, h / 2)], size)
+        visits: dict[int, list[torch.Tensor]] = {}
+        found = 0
+        for n, k in enumerate(order):
+            begin = time.process_time()
+            estimate = tracker(shown[k])
+            shortest[n] = min(shortest[n], 1e3 * (time.process_time() - begin))
+            found += bool(estimate.ok)
+            if estimate.status == Status.CONVERGED:
+                visits.setdefault(k, []).append(estimate.pose[0, :2])
     apart = max(float((torch.stack(v).amax(0) - torch.stack(v).amin(0)).amax()) for v in visits.values())
-    median, longest = sorted(times)[VISITS // 2], max(times)
+    median, longest = sorted(shortest)[VISITS // 2], max(shortest)
     figures = f"{apart:.3f}", f"{median:.2f}", f"{longest:.0f}", f"{longest / median:.0f}"
     return f"{folder.name}, {size} px", f"{found} of {VISITS}", *figures
 
@@ -133,7 +138,7 @@ def main() -> None:
     for levels, search in ((1, False), (2, False), (3, False), (1, True)):
         jumps.add_row(*basin(data / "pixel_shift", levels, search))
     console.print(jumps)
-    title = f"There and back, {VISITS} frames, processor time"
+    title = f"There and back, {VISITS} frames, processor time, of {RUNS} runs the shortest of each frame"
     visits = Table("sequence", "found", "px between visits", "median, ms", "longest, ms", "ratio", title=title)
     for name, center, size in (
         ("mechanism_video", (320.0, 240.0), 51),

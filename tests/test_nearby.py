@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from torch_ecc import Status, Tracker
+from torch_ecc.core.align import solve
 from torch_ecc.core.criteria import make_criterion
+from torch_ecc.core.filters import blur
 from torch_ecc.core.patches import cut, locate_patches
 from torch_ecc.core.pose import compose
 from torch_ecc.core.settings import Settings
-from torch_ecc.search.nearby import HALF_WIDTH, LARGEST_ANGLE, Nearby
+from torch_ecc.search.nearby import HALF_WIDTH, LARGEST_ANGLE, Nearby, solved_at
 from torch_ecc.sim.scene.scene import Pads, PlaneWaves
 from torch_ecc.track.recover import AT_ONCE, NEARBY_AT_ONCE, Recovery
 
@@ -40,6 +42,31 @@ def shots(scene, *steps: tuple[float, float, float]) -> torch.Tensor:
 
 def no_search(self, images, estimate, last, r):
     raise AssertionError("the whole frame was searched")
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize(("noise", "edge"), [(2.0, False), (15.0, False), (6.0, True)])
+def test_places_are_solved_together_as_one_by_one(count, noise, edge, monkeypatch):
+    """Of one template and of several, wanted or not, at once or in parts; in dim pictures, and at an edge whose noise
+    is taken for texture until it is pushed, those that are pushed too."""
+    generator = torch.Generator().manual_seed(3)
+    if edge:
+        still = (100 + 80 * ((torch.arange(FRAME[1]) - 160.0) / 2).tanh()).expand(1, 1, *FRAME)
+    else:
+        still = SCENES["rich"].render(MIDDLE[None], FRAME)
+    grain = torch.randn((2, 1, *FRAME), generator=generator)
+    given, seen = (still + noise * (blur(grain, 0.7) if edge else grain)).split(1)
+    centers = MIDDLE[:2] + torch.tensor([[0.0, 0.0], [1.0, 10.0], [-2.0, -20.0]], dtype=torch.float64)[:count]
+    reference = cut(given, locate_patches("", given, centers, (61, 61), None), LIGHT)
+    steps = torch.tensor([[0.0, 0.0, 0.0], [0.4, -0.3, 0.002], [70.0, 25.0, 0.1], [0.6, 0.2, 0.0]], dtype=torch.float64)
+    place = torch.nn.functional.pad(centers, (0, 1))[:, None] + steps
+    wanted = torch.tensor([[True, True, True, True], [True, False, True, False], [False, True, False, True]])[:count]
+    monkeypatch.setattr("torch_ecc.search.nearby.SOLVED_AT_ONCE", 3)
+    each = solved_at(reference, seen, place, wanted, Settings(robust=False))
+    for b, k in wanted.nonzero().tolist():
+        alone = solve(reference.select(torch.tensor([b])), seen, place[b, k][None], Settings(robust=False))
+        for name, one, other in zip(alone._fields, alone, each, strict=True):
+            assert torch.allclose(one[0].double(), other[b, k].double(), rtol=1e-6, atol=1e-7), name
 
 
 @pytest.mark.parametrize("turn", [0.0, 2.4])

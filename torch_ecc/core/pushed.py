@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.pose import retract, turn
-from torch_ecc.core.reference import Reference
+from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust
@@ -47,12 +47,22 @@ class Push(NamedTuple):
 
     def __call__(self, found: Solution, asked: Tensor) -> Tensor:
         """What is left, over what may be, of those that are ``asked`` (B,) bool, 0 of the others."""
-        trust = trusted(found, asked)
-        share = left_of_push(self.engine(), self.reference, self.image, self.settings, found, trust) / MOST_LEFT
+        share = self.left(found, asked) / MOST_LEFT
         if self.answered is not None:
             count = torch.where(share < CLEARLY, self.answered + 1, 0)
             self.answered.copy_(torch.where(asked, count, self.answered))
         return torch.where(asked, share, 0.0)
+
+    def left(self, found: Solution, asked: Tensor) -> Tensor:
+        """``left_of_push`` (B,) of those that are ``asked`` (B,); of copies of one template only they are solved."""
+        one, reference, image = self.reference.one, self.reference, self.image
+        if one is None or not is_cpu(asked.device):
+            return left_of_push(self.engine(), reference, image, self.settings, found, trusted(found, asked))
+        some = asked.nonzero()[:, 0]
+        reference, image = one.copies(len(some)), image if len(image) == 1 else image[some]
+        of_some = each(lambda value: value[some], found)
+        share = left_of_push(self.engine(), reference, image, self.settings, of_some, trusted(of_some, asked[some]))
+        return share.new_zeros(len(asked)).index_copy(0, some, share)
 
 
 @torch.no_grad()
@@ -69,8 +79,10 @@ def left_of_push(
     def again(start: Tensor) -> Solution:
         return engine(reference, image, start, settings.once, trust)
 
-    weak, strong = (answer(again, reference, found, way) for way in (least, most))
-    return 1 - weak / strong.clamp(LEAST_ANSWER, 1.0)
+    weak = answer(again, reference, found, least)
+    if is_cpu(weak.device) and min(weak.tolist()) > 1 - CLEARLY * MOST_LEFT:  # clearly, if most is left of no push
+        return 1 - weak
+    return 1 - weak / answer(again, reference, found, most).clamp(LEAST_ANSWER, 1.0)
 
 
 def answer(solve: Callable[[Tensor], Solution], reference: Reference, found: Solution, direction: Tensor) -> Tensor:

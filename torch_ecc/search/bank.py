@@ -13,7 +13,7 @@ from torch_ecc.core.noise import INSTRUMENT_BLUR
 from torch_ecc.core.pose import compose
 from torch_ecc.core.pyramid import as_images
 from torch_ecc.core.reference import Reference
-from torch_ecc.search.correlation import Correlator, Template, about_mean, detrended, peaks, rotated, span
+from torch_ecc.search.correlation import CHUNK, Correlator, Template, about_mean, detrended, peaks, rotated, span
 
 SMALLEST_SEARCHED = 24  # px: root of the area that a template keeps at the level at which it is searched for
 LEAST_DENSITY = 0.25  # of a level's pixels: texture per bandwidth, over that of white texture of the same contrast
@@ -22,7 +22,6 @@ COARSEST_STEP, FINEST_STEP = math.radians(6), math.radians(1.5)  # from one angl
 SMALLEST_DISC, LARGEST_DISC = 5, 24  # px: angles get closer with the radius, and this many pixels tell enough
 DISC_SHARE = 0.5  # of the texture must lie in a disc for the disc alone to be searched for
 TILE = 320  # px of a level that are transformed at once
-CHUNK = 4  # angles transformed at once: more would not stay in the cache
 
 
 class Bank(NamedTuple):
@@ -80,6 +79,14 @@ def _tiles(n: int, most: int) -> tuple[int, list[int]]:
     count = -(-n // most)
     length = -(-n // count)
     return length, [k * (n - length) // max(count - 1, 1) for k in range(count)]
+
+
+def most_levels(reference: Reference) -> int:
+    """How many levels of a pyramid there are at which enough of a template may be left, itself the first."""
+    level, (w, h) = 1, reference.grid.sides.tolist()
+    while math.ceil(w / 2**level) * math.ceil(h / 2**level) >= SMALLEST_SEARCHED**2:
+        level += 1
+    return level
 
 
 def search_level(references: list[Reference]) -> int:

@@ -21,6 +21,7 @@ from torch_ecc.core.pose import rotation
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import Sampler, inside
 
+CHUNK = 4  # angles transformed at once: more would not stay in the cache
 FLATTEST = 1e-4  # of the image's variance: a place that has less of its own counts as having that much
 
 
@@ -65,7 +66,7 @@ class Correlator(NamedTuple):
         """From kernels (B, A, n, m), (B, 1 or A, n, m) and (B, 1 or A, P, n, m), for images of ``size`` (h, w)."""
         n, m = texture.shape[-2:]
         shape = (fast_length(size[0]), fast_length(size[1]))
-        spectra = (torch.fft.rfft2(kernel, s=shape).conj_physical() for kernel in (texture, planes, weight))
+        spectra = (_spectra(kernel, shape) for kernel in (texture, planes, weight))
         return Correlator((size[0] - n + 1, size[1] - m + 1), shape, *spectra)
 
     @property
@@ -99,6 +100,16 @@ class Correlator(NamedTuple):
         rows = torch.fft.ifft(product, dim=-2)[..., :h, :]  # the others are not transformed any further
         whole: Tensor = torch.fft.irfft(rows, n=self.shape[1], dim=-1)
         return whole[..., :w]
+
+
+def _spectra(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Conjugated spectra (B, A, ..., H, W // 2 + 1) of ``kernels`` (B, A, ..., n, m) in images of ``shape`` (H, W)."""
+    h, w = shape
+    spectra = kernels.new_empty(*kernels.shape[:-2], h, w // 2 + 1, dtype=kernels.dtype.to_complex())
+    for part, kernel in zip(spectra.split(CHUNK, 1), kernels.split(CHUNK, 1), strict=True):
+        rows = torch.fft.rfft(kernel, n=w)  # the others are zero
+        torch.conj_physical(torch.fft.fft(rows, n=h, dim=-2), out=part)
+    return spectra
 
 
 def about_mean(image: Tensor, weight: Tensor) -> Tensor:

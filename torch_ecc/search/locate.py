@@ -28,11 +28,10 @@ from torch_ecc.core.sampling import Sampler, inside
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled, picked
 from torch_ecc.core.verdict import within_margin
-from torch_ecc.search.bank import Bank, search_level
+from torch_ecc.search.bank import Bank, most_levels, search_level
 from torch_ecc.search.matched_filter import whitened_matches
 from torch_ecc.search.nearby import Allowed
 
-MAX_LEVELS = 8  # of a pyramid: it ends where the template gets too small
 SMALLEST_FRAME = 12  # px: a frame is not downsampled below this side
 CANDIDATES = 192  # local maxima that are aligned at most: those of score s >= max(LEAST_SCORE, s_best - margin)
 LEAST_SCORE = 0.3
@@ -108,7 +107,8 @@ class Locator:
         self.settings = replace(settings or Settings(min_visible=LEAST_VISIBLE), robust=False)
         self.pyramids, self.banks = [], []
         for b in range(len(reference.place.radius)):
-            references = pyramid(reference.select(torch.tensor([b], device=reference.place.radius.device)), MAX_LEVELS)
+            one = reference.select(torch.tensor([b], device=reference.place.radius.device))
+            references = pyramid(one, most_levels(one))
             level = min(search_level(references), max((min(size) // SMALLEST_FRAME).bit_length() - 1, 0))
             h, w = (-(-n // 2**level) for n in size)
             self.pyramids.append(references[: level + 1])
@@ -188,7 +188,8 @@ class Locator:
         estimate = solve(copies, image, pose, self.settings)
         for _ in range(MAX_RESTARTS):  # where the texture lets a pose slide, iterations are spent on the way
             distance = pose_distance(estimate.displacement, torch.zeros_like(pose), radius=copies.place.radius)
-            far = (distance > RESTART_DISTANCE).nonzero()[:, 0]
+            spent = estimate.status == Status.MAX_ITERATIONS
+            far = (spent & (distance > RESTART_DISTANCE)).nonzero()[:, 0]
             if len(far) == 0:
                 break
             again = solve(reference.copies(len(far)), image, estimate.pose[far], self.settings)

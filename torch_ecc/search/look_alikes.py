@@ -12,12 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ecc.core.align import solve
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.search.locate import SUPPRESSION, Locator, image_pyramid, pose_distance
-from torch_ecc.search.nearby import HALF_WIDTH, SCORE_MARGIN, Nearby
+from torch_ecc.search.nearby import HALF_WIDTH, SCORE_MARGIN, Nearby, solved_at
 
 REACH = 2 * HALF_WIDTH  # px to each side: twice as far as a search near can lead
 NEAR_MOST = 8  # places that are looked at near
@@ -50,10 +49,8 @@ def look_alikes_near(reference: Reference, image: Tensor, home: Tensor, settings
     """Of each of B templates in the ``image`` (1 or B, 1, H, W) where they are at ``home`` (B, 3): within REACH."""
     place, score = Nearby.of(reference, REACH).candidates(image, home, NEAR_MOST)
     high = score >= score.amax(-1, keepdim=True) - SCORE_MARGIN
-    places = torch.where(high[..., None], place, home[:, None])
-    found = [solve(reference, image, places[:, k].contiguous(), settings) for k in range(NEAR_MOST)]
-    each = Estimate(*(torch.stack(values, 1) for values in zip(*found, strict=True)))
-    radius = reference.place.radius
+    each, radius = solved_at(reference, image, place, high, settings), reference.place.radius
+    each = each._replace(pose=torch.where(high[..., None], each.pose, home[:, None]))
     return [LookAlikes.around(Estimate(*(value[b] for value in each)), home[b], radius[b]) for b in range(len(home))]
 
 

@@ -30,6 +30,7 @@ SPACINGS = (8, 4, 2, 1)  # px between the pixels that are compared
 LEAST_DENSITY = 2.0  # texture that is left, over what white noise of the same contrast would leave
 LARGEST_KERNEL = 49  # pixels across: they tell enough
 CANDIDATES = 5  # places per template that are brought to the answer: those with
+SOLVED_AT_ONCE = 64  # of them
 SCORE_MARGIN, LEAST_SCORE = 0.25, 0.2  # s >= max(s_best - margin, least), the nearest first
 FARTHER_MARGIN = (0.9, 0.002)  # (a, b): a farther place of score s is better if 1 - s < a (1 - s_nearer) - b
 
@@ -81,14 +82,14 @@ class Nearby(NamedTuple):
         distance = torch.where(score >= least, distance, torch.inf)
         distance, order = distance.sort(-1)
         place = place.gather(1, order[..., None].expand_as(place))
-        best = solve(reference, image, place[:, 0], settings)
+        wanted = distance.isfinite()
+        wanted[:, 0] = True  # there is always an answer
+        each = solved_at(reference, image, place, wanted, settings)
+        best = Estimate(*(value[:, 0] for value in each))
         for k in range(1, CANDIDATES):
-            index = distance[:, k].isfinite().nonzero()[:, 0]
-            if len(index):
-                images = image if len(image) == 1 else image[index]
-                farther = solve(reference.select(index), images, place[index, k], settings)
-                replaced = better(farther, best.at(index)).nonzero()[:, 0]
-                best = best.put(index[replaced], farther.at(replaced))
+            farther = Estimate(*(value[:, k] for value in each))
+            replaced = (wanted[:, k] & better(farther, best)).nonzero()[:, 0]
+            best = best.put(replaced, farther.at(replaced))
         return best._replace(origin=torch.full_like(best.origin, int(Origin.NEARBY)))
 
     def candidates(self, image: Tensor, pose: Tensor, most: int = CANDIDATES) -> tuple[Tensor, Tensor]:
@@ -114,6 +115,18 @@ class Nearby(NamedTuple):
         g = Sampler.of(image)(warp, pixels).view(-1, *sides)
         rows, columns = (_resampling(*n, self.spacing, g) for n in zip(sides, self.shape, strict=True))
         return rows @ g @ columns.mT
+
+
+def solved_at(reference: Reference, image: Tensor, place: Tensor, wanted: Tensor, settings: Settings) -> Estimate:
+    """B templates solved in an ``image`` (1 or B, 1, H, W) from the ``wanted`` (B, K) ones of their places (B, K, 3):
+    Estimate (B, K, ...), in which the others have that of any."""
+    pairs = wanted.nonzero().split(SOLVED_AT_ONCE)
+    parts = []
+    for which, k in (pair.T for pair in pairs):
+        some = reference.copies(len(which)) if len(place) == 1 else reference.select(which)
+        parts.append(solve(some, image if len(image) == 1 else image[which], place[which, k], settings))
+    row = (wanted.flatten().cumsum(0) - 1).clamp(min=0).view_as(wanted)
+    return Estimate(*(torch.cat(values)[row] for values in zip(*parts, strict=True)))
 
 
 def better(farther: Estimate, nearer: Estimate) -> Tensor:
