@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.ambient import constant
@@ -96,8 +97,21 @@ def explained(residuals: Residuals, grid: tuple[int, int]) -> tuple[Tensor, Tens
         square = strain[:, :, None] * strain[:, None] + uncertain
         strained = strained_pose(strains, square * (certain / gain.to(certain).square())[:, None, None])
     scatter = ratio[:, :1].clamp(min=1.0)
-    lines = ratio * _shares(grid, ratio.dtype, ratio.device)[1]
+    lines = ratio * few_lines(strains.share.to(ratio.dtype), grid)
     return torch.where(ratio > scatter, lines, scatter).amax(1, keepdim=True), strained
+
+
+def few_lines(share: Tensor, grid: tuple[int, int]) -> Tensor:
+    """How many times their scatter that of blocks, and of rows and columns of them, may be, (B, 3, 3), if blocks bear
+    on a pose by a ``share`` (B, 3, blocks).
+
+    The fit has made the sum of n lines zero, and an error over a scatter of so few has Student's distribution, with the
+    variance (n - 1) / (n - 3). Lines that bear little are none: n = (sum s)^2 / sum s^2 (Kish, Survey Sampling, 1965).
+    """
+    power = share.unflatten(2, grid)
+    lines = [each.sum(2).square() / each.square().sum(2).clamp(min=LEAST) for each in (power.sum(3), power.sum(2))]
+    n = torch.stack(lines, 1).clamp(min=1)
+    return F.pad((1 + SURE * (2 / n).sqrt()) * n / (n - 3).clamp(min=1), (0, 0, 1, 0), value=1.0)
 
 
 def strains(reference: Reference, found: Solution) -> Strains:
@@ -111,18 +125,5 @@ def strains(reference: Reference, found: Solution) -> Strains:
 @constant
 def _scales(grid: tuple[int, int], free: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     """What makes the scatter (3, 1) of blocks, and of rows and columns of them, that which is so for certain."""
-    return torch.tensor([[free], [1], [1]], dtype=dtype, device=device) / _shares(grid, dtype, device)[0]
-
-
-@constant
-def _shares(grid: tuple[int, int], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Of blocks, and of rows and columns of a grid of them, (3, 1) each: how many times the scatter of blocks theirs is
-    for certain; and that times what makes up for so few.
-
-    The fit has made the sum of n lines zero, and an error over a scatter of so few has Student's distribution, with the
-    variance (n - 1) / (n - 3).
-    """
-    sure, free = [1 + SURE * (2 / n) ** 0.5 for n in grid], [n / max(n - 3, 1) for n in grid]
-    most = [s * f for s, f in zip(sure, free, strict=True)]
-    both = torch.tensor([[1.0, *sure], [1.0, *most]], dtype=dtype, device=device)[:, :, None]
-    return both[0], both[1]
+    sure = [1 / (1 + SURE * (2 / n) ** 0.5) for n in grid]
+    return torch.tensor([free, *sure], dtype=dtype, device=device)[:, None]

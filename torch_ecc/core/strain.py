@@ -23,12 +23,14 @@ BY_CHANCE = 14.0  # so large may the square of 7 strains over its variance be by
 class Strains(NamedTuple):
     """Of B templates: the ``pattern`` (B, 7, 3 blocks) that each of ``STRAINS`` leaves in every block under a gain of
     1, as a pose feels it; the ``fit`` (B, 7, 3 blocks) that takes such an effect to the strains that it is of, by least
-    squares over what white noise leaves there; by what they ``shift`` the pose, (B, 3, 7), and the ``radius`` (B,)."""
+    squares over what white noise leaves there; by what they ``shift`` the pose, (B, 3, 7), and the ``radius`` (B,); and
+    by how much each block bears on the pose, ``share`` (B, 3, blocks)."""
 
     pattern: Tensor
     fit: Tensor
     shift: Tensor
     radius: Tensor
+    share: Tensor
 
 
 def strains_of(parts: Parts, normal: Normal, share: Tensor | None = None) -> Strains:
@@ -45,7 +47,7 @@ def strains_of(parts: Parts, normal: Normal, share: Tensor | None = None) -> Str
     pattern = torch.einsum("bkp,bpmn->bmkn", rows, left).flatten(2)
     weighted = pattern / spread.clamp(min=LEAST).flatten(1).unsqueeze(1)
     fit = safe_inverse(weighted @ pattern.mT)[0] @ weighted
-    return Strains(pattern, fit, shift[:, :3], parts.radius)
+    return Strains(pattern, fit, shift[:, :3], parts.radius, power)
 
 
 def strained_by(strains: Strains, effect: Tensor) -> tuple[Tensor, Tensor, Tensor]:
