@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_ecc import Status, align, prepare
 from torch_ecc.core.blocks import STRAINS
-from torch_ecc.core.clinging import clinging, scale_of
+from torch_ecc.core.clinging import clinging, few_lines, scale_of
 from torch_ecc.core.clinging import strains as strains_shown
 from torch_ecc.core.native.engine import solve as native
 from torch_ecc.core.settings import Settings
@@ -116,3 +116,19 @@ def test_engines_agree_on_what_clings_together():
             ones = torch.ones_like(found.gain)
             values.append(clinging(reference, found, 1e-3 * ones, scale_of(reference.grid, found.normal)))
         torch.testing.assert_close(values[0].scatter, values[1].scatter, rtol=2e-2, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("grid", "rows", "columns"), [((15, 21), 15, 21), ((15, 21), 5, 21), ((15, 21), 15, 2), ((9, 9), 4, 4)]
+)
+def test_lines_that_bear_little_are_none(grid, rows, columns):
+    """What lines scatter by chance depends on how many of them bear on the pose, not on how many there are; and is the
+    more the fewer they are."""
+    share = torch.full((1, 3, *grid), 1e-6)
+    share[:, :, :rows, :columns] = 1.0
+    times = few_lines(share.flatten(2), grid)
+    alone = few_lines(torch.ones(1, 3, rows * columns), (rows, columns))
+    assert (times[:, 0] == 1).all()
+    assert torch.allclose(times, alone, rtol=1e-3)
+    for axis, n in ((1, rows), (2, columns)):
+        assert torch.allclose(times[:, axis], torch.tensor((1 + 3 * (2 / n) ** 0.5) * n / max(n - 3, 1)), rtol=1e-3)

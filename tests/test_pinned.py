@@ -12,6 +12,7 @@ from torch_ecc.core.leverage import disagreement
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution
+from torch_ecc.sim.scene.speckle import Speckle
 from torch_ecc.sim.scene.waves import PlaneWaves
 from torch_ecc.track import pinned
 
@@ -108,6 +109,20 @@ def test_sigma_covers_what_a_mark_does_to_a_slow_drift(seed: int, monkeypatch: p
     assert not wrong(track, path).any()
     monkeypatch.setattr("torch_ecc.track.advance.held", lambda estimate, *_: estimate)
     assert wrong(Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:]), path).any()
+
+
+def test_sigma_covers_what_columns_that_stay_do_to_a_slow_drift() -> None:
+    """They hold it along x however far it is along y, and still do where a mark would show by itself."""
+    path = poses(torch.arange(1, 45)[:, None] * torch.tensor([[-0.055, -0.033]]))
+    clean = Speckle.random(seed=0).render(path, SHAPE)[:, 0].float()
+    source = torch.Generator().manual_seed(0)
+    columns = 6 * torch.randn(1, SHAPE[1], generator=source)
+    shown = 110 + 15 * (clean - clean.mean()) / clean.std() + columns
+    frames = (shown + 1.5 * torch.randn(clean.shape, generator=source)).round().clamp(0, 255).to(torch.uint8)
+    track = Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:])
+    error, far = (track.pose[:, 0] - path[1:]).abs()[:, 0], (path[1:] - path[0]).norm(dim=1) > 2.2
+    assert error[far].max() > 0.2
+    assert (error < track.sigma[:, 0, 0])[far].all()
 
 
 def effects(reference: Reference, image: Tensor) -> Solution:
