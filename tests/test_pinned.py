@@ -6,12 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from torch_ecc import Track, Tracker
+from torch_ecc import Track, Tracker, prepare
 from torch_ecc.core.align import solve_again
 from torch_ecc.core.leverage import disagreement
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Solution
+from torch_ecc.sim.scene.pads import Pads
 from torch_ecc.sim.scene.speckle import Speckle
 from torch_ecc.sim.scene.waves import PlaneWaves
 from torch_ecc.track import pinned
@@ -111,18 +112,61 @@ def test_sigma_covers_what_a_mark_does_to_a_slow_drift(seed: int, monkeypatch: p
     assert wrong(Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:]), path).any()
 
 
-def test_sigma_covers_what_columns_that_stay_do_to_a_slow_drift() -> None:
-    """They hold it along x however far it is along y, and still do where a mark would show by itself."""
-    path = poses(torch.arange(1, 45)[:, None] * torch.tensor([[-0.055, -0.033]]))
-    clean = Speckle.random(seed=0).render(path, SHAPE)[:, 0].float()
-    source = torch.Generator().manual_seed(0)
-    columns = 6 * torch.randn(1, SHAPE[1], generator=source)
-    shown = 110 + 15 * (clean - clean.mean()) / clean.std() + columns
-    frames = (shown + 1.5 * torch.randn(clean.shape, generator=source)).round().clamp(0, 255).to(torch.uint8)
-    track = Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:])
-    error, far = (track.pose[:, 0] - path[1:]).abs()[:, 0], (path[1:] - path[0]).norm(dim=1) > 2.2
-    assert error[far].max() > 0.2
-    assert (error < track.sigma[:, 0, 0])[far].all()
+def before_lines(axis: int, seed: int, offset: float) -> tuple[Tensor, Tensor]:
+    """A slow drift (F + 1, 3), and its frames (F + 1, H, W) from a sensor whose columns, or rows for the ``axis`` 1,
+    have offsets of their own, on a contrast of fifteen."""
+    path = poses(torch.arange(1, 45)[:, None] * torch.tensor([[-0.055, -0.033] if axis == 0 else [0.033, 0.055]]))
+    clean, source = Speckle.random(seed=seed).render(path, SHAPE)[:, 0].float(), torch.Generator().manual_seed(seed)
+    lines = offset * torch.randn((1, SHAPE[1]) if axis == 0 else (SHAPE[0], 1), generator=source)
+    shown = 110 + 15 * (clean - clean.mean()) / clean.std() + lines
+    return path, (shown + 1.5 * torch.randn(clean.shape, generator=source)).round().clamp(0, 255).to(torch.uint8)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_sigma_covers_what_lines_that_stay_do_to_a_slow_drift(axis: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They hold it along one axis; by how much is told from what they leave a little off, and remembered."""
+
+    def ratio(seed: int) -> Tensor:
+        path, frames = before_lines(axis, seed, 4.0)
+        track = Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:])
+        assert (track.status == 0).all()
+        return ((track.pose[:, 0] - path[1:]) / track.sigma[:, 0])[8:, axis]
+
+    ratios = torch.stack([ratio(seed) for seed in range(3)])
+    assert ratios.abs().max() < 3
+    assert ratios.square().mean().sqrt() < 1.5
+    monkeypatch.setattr("torch_ecc.track.advance.lined", lambda estimate, *_: estimate)
+    assert torch.stack([ratio(seed) for seed in range(3)]).abs().max() > 5
+
+
+def test_a_sensor_without_lines_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sigma is as if nobody asked, also before a scene of straight edges along both axes; noise is some by chance."""
+    for seed, scene in enumerate(
+        [*(Speckle.random(seed=k) for k in range(2)), *(Pads.wafer(seed=k) for k in range(2))]
+    ):
+        path = poses(torch.arange(1, 30)[:, None] * torch.tensor([[-0.12, 0.1]]))
+        clean, source = scene.render(path, SHAPE)[:, 0].float(), torch.Generator().manual_seed(seed)
+        frames = (clean + 1.5 * torch.randn(clean.shape, generator=source)).round().clamp(0, 255).to(torch.uint8)
+        tracker = Tracker(frames[0], [HOME], SIZE)
+        track = tracker.track_sequence(frames[1:])
+        assert (tracker.lines[:, :, 1] > 2).all()
+        with monkeypatch.context() as alone:
+            alone.setattr("torch_ecc.track.advance.lined", lambda estimate, *_: estimate)
+            more = track.sigma / Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:]).sigma
+        assert more.min() >= 1
+        assert more.max() < 1.1
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_template_has_as_much_of_lines_as_it_shows(axis: int) -> None:
+    """Offsets of variance v, and nothing of a smooth scene."""
+    source = torch.Generator().manual_seed(axis)
+    smooth = PlaneWaves.random(seed=1).render(poses(torch.zeros(0, 2)), SHAPE)[0, 0].float()
+    lines = 3 * torch.randn((1, SHAPE[1]) if axis == 0 else (SHAPE[0], 1), generator=source)
+    for shown, expected in ((smooth, 0.0), (smooth + lines, float(lines.var()))):
+        most = prepare(shown).blocks.lined[0]
+        assert float(most[axis]) == pytest.approx(expected, rel=0.35, abs=0.3)
+        assert float(most[1 - axis]) < 0.3
 
 
 def effects(reference: Reference, image: Tensor) -> Solution:

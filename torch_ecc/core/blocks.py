@@ -15,6 +15,7 @@ from torch_ecc.core.grid import BLOCK, Grid
 if TYPE_CHECKING:
     from torch_ecc.core.reference import Reference
 
+THIRD = 20.0  # times a variance is that of third differences
 HALF_FULL = 0.5  # of the fullest block's weight: a block with less of it tells too little
 
 
@@ -23,7 +24,8 @@ class Blocks(NamedTuple):
     its ``square``, the mean square of the texture's slopes, or of those around if that is more, ``slope``; and which of
     those that hold pixels enough are ``flat``, as half of them are, or ``steep``, as is the other half; ``enough``:
     either; ``share``: what their weighted sums are to be multiplied by for a mean, 0 of the others; by how much their
-    slopes count as instruments, the mean of ``wiener``."""
+    slopes count as instruments, the mean of ``wiener``. ``lined`` (B, 2): the variance of offsets that columns, and
+    rows, of the template may have at most."""
 
     weight: Tensor
     t: Tensor
@@ -34,6 +36,7 @@ class Blocks(NamedTuple):
     enough: Tensor
     share: Tensor
     wiener: Tensor
+    lined: Tensor
 
 
 # By what parts of a target, at (x, y) about its centre, may move other than as one, and whether that is half a turn:
@@ -76,7 +79,21 @@ def blocks_of(reference: Reference) -> Blocks:
     middle = torch.where(enough, slope, torch.nan).nanmedian(1, keepdim=True).values
     share = torch.where(enough, 1 / count, 0.0)
     flat, wiener = slope <= middle, wiener / count.clamp(min=1e-30)
-    return Blocks(count, of_t, square, slope, enough & flat, enough & ~flat, enough, share, wiener)
+    lined = torch.stack([line_variance(grid, axis, weight, t) for axis in (0, 1)], 1)
+    return Blocks(count, of_t, square, slope, enough & flat, enough & ~flat, enough, share, wiener, lined)
+
+
+def line_variance(grid: Grid, axis: int, weight: Tensor, t: Tensor) -> Tensor:
+    """That (B,) of the offsets that lines of templates ``t`` (B, N) under a ``weight`` (B, N) can have, one after the
+    other along an ``axis`` of their ``grid``: by third differences of their means, which leave next to nothing of a
+    smooth scene."""
+    line = (grid.pixels[axis] - grid.box[axis, 0]).round().long()
+    sums = t.new_zeros(2, len(t), int(grid.sides[axis])).index_add_(2, line, torch.stack((weight, weight * t)))
+    full = sums[0] > HALF_FULL * sums[0].amax(1, keepdim=True)
+    mean = sums[1] / sums[0].clamp(min=1e-30)
+    off = mean.diff(n=3, dim=1)
+    known = full[:, 3:] & full[:, 2:-1] & full[:, 1:-2] & full[:, :-3]
+    return (off.square() * known).sum(1) / (THIRD * known.sum(1).clamp(min=1))
 
 
 def parts_of(reference: Reference) -> Parts:

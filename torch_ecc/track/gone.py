@@ -14,6 +14,7 @@ from torch_ecc.core.align import solve_again
 from torch_ecc.core.estimate import Estimate, Origin, Reason
 from torch_ecc.core.robust import Memory
 from torch_ecc.track.doubt import Past
+from torch_ecc.track.lined import lined
 from torch_ecc.track.pinned import held
 from torch_ecc.track.recover import Recovery
 
@@ -40,10 +41,10 @@ def searched_first(
 
 def covered(recovery: Recovery, image: Tensor, start: Tensor, index: Tensor, state: Mapping[str, Tensor]) -> Estimate:
     """Templates at ``index`` (n,) of a ``state``, solved robustly; what of them is believed goes into it."""
-    part = {name: state[name][index] for name in ("score", "trust", "answered", "start", "fixed", "heed")}
+    part = {name: state[name][index] for name in ("score", "trust", "answered", "start", "fixed", "lines", "heed")}
     view, memory = image if len(image) == 1 else image[index], Memory(part["score"], part["trust"], part["answered"])
     reference = recovery.reference.select(index)
     estimate, found = solve_again(reference, view, start[index], recovery.as_tracked, part["start"], memory)
     if found.trust is not None:
         state["trust"].index_copy_(0, index, torch.where(estimate.ok[:, None], found.trust, 1.0))
-    return held(estimate, found, reference, part)
+    return lined(held(estimate, found, reference, part), found, reference, part)

@@ -95,11 +95,12 @@ def lessons_in(state: State) -> Lessons | None:
 
 def with_new_parts(state: dict[str, Any], prefix: str) -> None:
     """What was saved with fewer means of older ages, or before these had places of their own, or a tracker shares of
-    noise that stays and doubts of a look, is filled, in place."""
+    noise and lines that stay and doubts of a look, is filled, in place."""
     start = state.get(f"{prefix}start")
     if isinstance(start, Tensor) and start.dim() == 2:
         state.setdefault(f"{prefix}fixed", torch.zeros_like(start[:, 0]))
         state.setdefault(f"{prefix}doubt", start.new_zeros(len(start), 3, 3))
+        state.setdefault(f"{prefix}lines", start.new_zeros(len(start), 2, 2))
     images, places = (f"{prefix}lesson_{name}" for name in ("older", "places"))
     older = state.get(images)
     if isinstance(older, Tensor) and older.dim() == 4 and 0 < older.shape[1] <= AGES:

@@ -64,7 +64,7 @@ class Look:
     @property
     def kept(self) -> list[Tensor]:
         """What a look leaves for the next one."""
-        return [self.state[name] for name in ("trust", "answered", "fixed")]
+        return [self.state[name] for name in ("trust", "answered", "fixed", "lines")]
 
     def graph(self, image: Tensor, put_off: bool) -> Graph:
         """That for frames like an ``image``."""

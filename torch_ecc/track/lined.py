@@ -1,0 +1,85 @@
+"""Lines of a sensor with offsets of their own, the same in all frames, hold a template where that was cut.
+
+They do along one axis, however far it has gone along the other, as a fixed pattern does (``pinned``): of offsets of
+variance v by
+
+    S^-1 v N d exp(-d^2 / REACH),
+
+where N is what lines of unit variance add to the sums over the template's gradients. From one block of BLOCK lines to
+the next they leave, a displacement of d px away, residuals whose means have second differences of mean square
+
+    TOLD v min(d, d^2)
+
+(both measured on lines before scenes of four kinds, of which they do not depend: within a fifth from 0.3 to 2.5 px). No
+more can be theirs than the template has of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torch_ecc.core.estimate import Estimate, Status
+from torch_ecc.core.normal import LEAST
+from torch_ecc.core.pose import turn
+from torch_ecc.core.reference import Reference
+from torch_ecc.core.sampling import is_cpu
+from torch_ecc.core.solution import Solution
+from torch_ecc.track.pinned import REACH, uncertain
+from torch_ecc.track.watch import FAR
+
+OF_LINES = 0.5  # of what white noise adds to the sums if it is not blurred at all
+TOLD = 0.55  # px, of six of them
+NEAREST, FARTHER, FARTHEST = 0.05, 1.2, 4.0  # px, times as far, px: where it is asked for, once each
+SURE, FREE = 3.0, 1.8  # standard deviations, of squares of neighbours that are not free of each other
+FULL = 0.5  # of the fullest line's weight
+
+
+def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapping[str, Tensor]) -> Estimate:
+    """The ``estimate`` (R, ...) of what was ``found`` in a frame, whose covariance tells of the pull of lines. What is
+    known of them, ``lines`` (R, 2, 2) in the ``state`` of a tracker, their variance along x and y and how far off it
+    was asked for, is asked for again farther off."""
+    lines, moved = state["lines"], estimate.displacement.detach()[:, :2]
+    on_cpu = is_cpu(moved.device)
+    asked, pulled = (True, True) if on_cpu is False else due(moved.tolist(), lines.tolist())
+    if asked:
+        reach, (power, before) = moved.abs().clamp(max=FARTHEST), lines.unbind(2)
+        told = torch.stack([offsets(found, reference, axis) for axis in (0, 1)], 1)
+        new = told / (TOLD * torch.minimum(reach, reach.square())).clamp(min=LEAST)
+        farther = Status.good(estimate.status)[:, None] & (reach > FARTHER * before + NEAREST)
+        power = torch.where(farther, torch.minimum(new, reference.blocks.lined.to(new)), power)
+        lines.copy_(torch.stack((power, torch.where(farther, reach, before)), 2))
+        pulled = pulled or bool((power > 0).any())
+    if not pulled:
+        return estimate
+    along = (turn(estimate.pose.detach()[:, 2]).mT[:, :2, :2] @ moved[:, :, None])[:, :, 0]
+    near = torch.where(along.abs() <= FAR, along * (-along.square() / REACH).exp(), 0.0)
+    pull = OF_LINES / reference.noise.response[:, :1] * lines[:, :, 0] * near
+    off = reference.normal.inverse[:, :3, :3] @ (reference.normal.bread_bias[:, :, :2] * pull[:, None])
+    return uncertain(uncertain(estimate, off[:, :, 0]), off[:, :, 1])
+
+
+def due(moved: list[list[float]], lines: list[list[list[float]]]) -> tuple[bool, bool]:
+    """Whether the host sees that ``lines`` (R, 2, 2) are to be asked for, of templates that have ``moved`` (R, 2) px,
+    and whether those that are known bear on any."""
+    each = [(abs(d), *line) for ds, two in zip(moved, lines, strict=True) for d, line in zip(ds, two, strict=True)]
+    asked = any(min(d, FARTHEST) > FARTHER * before + NEAREST for d, _, before in each)
+    return asked, any(power > 0 and d <= FAR for d, power, _ in each)
+
+
+def offsets(found: Solution, reference: Reference, axis: int) -> Tensor:
+    """The mean square (R,) of the second differences of means of lines of blocks along an ``axis``, x or y, that noise
+    does not explain."""
+    blocks, sums, gain = reference.blocks, found.sums, found.gain[:, None].to(found.sums)
+    weight = sums[:, 0] if found.trust is None else sums[:, 0] * found.trust
+    mean = sums[:, 1] / sums[:, 0].clamp(min=LEAST) - gain * blocks.t / blocks.weight.clamp(min=LEAST)
+    count, total = torch.stack((weight, weight * mean)).unflatten(2, reference.grid.blocks).sum(2 + axis)
+    full, line = count > FULL * count.amax(1, keepdim=True), total / count.clamp(min=LEAST)
+    known = full[:, 2:] & full[:, 1:-1] & full[:, :-2]
+    n, white = known.sum(1).clamp(min=1), found.total[:, 6] / found.total[:, 0].clamp(min=LEAST)
+    each = 1 / count.clamp(min=LEAST)
+    by_noise = ((each[:, 2:] + 4 * each[:, 1:-1] + each[:, :-2]) * known).sum(1) / n * white
+    more = (line.diff(n=2, dim=1).square() * known).sum(1) / n - by_noise
+    return torch.where(more > SURE * (2 * FREE / n).sqrt() * by_noise, more, 0.0)
