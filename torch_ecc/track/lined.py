@@ -10,8 +10,8 @@ the next they leave, a displacement of d px away, residuals whose means have sec
 
     TOLD v min(d, d^2)
 
-(both measured on lines before scenes of four kinds, of which they do not depend: within a fifth from 0.3 to 2.5 px). No
-more can be theirs than the template has of it.
+(OF_LINES and TOLD were measured with lines before scenes of four kinds, on which they do not depend: within a fifth
+from 0.3 to 2 px). No more can be theirs than the template has of it.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from torch_ecc.core.solution import Solution
 from torch_ecc.track.pinned import REACH, uncertain
 from torch_ecc.track.watch import FAR
 
-OF_LINES = 0.5  # of what white noise adds to the sums if it is not blurred at all
-TOLD = 0.55  # px, of six of them
+OF_LINES = 0.5  # N is so much of what white noise adds, over that noise's response to the instruments' blur
+TOLD = 0.55  # of means of BLOCK lines
 NEAREST, FARTHER, FARTHEST = 0.05, 1.2, 4.0  # px, times as far, px: where it is asked for, once each
 SURE, FREE = 3.0, 1.8  # standard deviations, of squares of neighbours that are not free of each other
 FULL = 0.5  # of the fullest line's weight
@@ -42,8 +42,7 @@ def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapp
     known of them, ``lines`` (R, 2, 2) in the ``state`` of a tracker, their variance along x and y and how far off it
     was asked for, is asked for again farther off."""
     lines, moved = state["lines"], estimate.displacement.detach()[:, :2]
-    on_cpu = is_cpu(moved.device)
-    asked, pulled = (True, True) if on_cpu is False else due(moved.tolist(), lines.tolist())
+    asked, pulled = due(moved.tolist(), lines.tolist()) if is_cpu(moved.device) else (True, True)
     if asked:
         reach, (power, before) = moved.abs().clamp(max=FARTHEST), lines.unbind(2)
         told = torch.stack([offsets(found, reference, axis) for axis in (0, 1)], 1)
