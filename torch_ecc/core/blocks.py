@@ -88,11 +88,12 @@ def line_variance(grid: Grid, axis: int, weight: Tensor, t: Tensor) -> Tensor:
     other along an ``axis`` of their ``grid``: by third differences of their means, which leave next to nothing of a
     smooth scene."""
     line = (grid.pixels[axis] - grid.box[axis, 0]).round().long()
-    sums = t.new_zeros(2, len(t), int(grid.sides[axis])).index_add_(2, line, torch.stack((weight, weight * t)))
+    most = grid.blocks[1 - axis] * BLOCK
+    sums = t.new_zeros(2, len(t), most).index_add_(2, line, torch.stack((weight, weight * t)))
     full = sums[0] > HALF_FULL * sums[0].amax(1, keepdim=True)
     mean = sums[1] / sums[0].clamp(min=1e-30)
     off = mean.diff(n=3, dim=1)
-    known = full[:, 3:] & full[:, 2:-1] & full[:, 1:-2] & full[:, :-3]
+    known = (full[:, 3:] & full[:, 2:-1] & full[:, 1:-2] & full[:, :-3]).to(t)
     return (off.square() * known).sum(1) / (THIRD * known.sum(1).clamp(min=1))
 
 

@@ -76,7 +76,7 @@ def offsets(found: Solution, reference: Reference, axis: int) -> Tensor:
     mean = sums[:, 1] / sums[:, 0].clamp(min=LEAST) - gain * blocks.t / blocks.weight.clamp(min=LEAST)
     count, total = torch.stack((weight, weight * mean)).unflatten(2, reference.grid.blocks).sum(2 + axis)
     full, line = count > FULL * count.amax(1, keepdim=True), total / count.clamp(min=LEAST)
-    known = full[:, 2:] & full[:, 1:-1] & full[:, :-2]
+    known = (full[:, 2:] & full[:, 1:-1] & full[:, :-2]).to(line)
     n, white = known.sum(1).clamp(min=1), found.total[:, 6] / found.total[:, 0].clamp(min=LEAST)
     each = 1 / count.clamp(min=LEAST)
     by_noise = ((each[:, 2:] + 4 * each[:, 1:-1] + each[:, :-2]) * known).sum(1) / n * white
