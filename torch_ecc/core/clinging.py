@@ -111,7 +111,12 @@ def few_lines(share: Tensor, grid: tuple[int, int]) -> Tensor:
     power = share.unflatten(2, grid)
     lines = [each.sum(2).square() / each.square().sum(2).clamp(min=LEAST) for each in (power.sum(3), power.sum(2))]
     n = torch.stack(lines, 1).clamp(min=1)
-    return F.pad((1 + SURE * (2 / n).sqrt()) * n / (n - 3).clamp(min=1), (0, 0, 1, 0), value=1.0)
+    return F.pad(by_chance(n) * n / (n - 3).clamp(min=1), (0, 0, 1, 0), value=1.0)
+
+
+def by_chance(n: Tensor) -> Tensor:
+    """How many times the scatter of blocks that of ``n`` lines of them may be without meaning anything."""
+    return 1 + SURE * (2 / n).sqrt()
 
 
 def strains(reference: Reference, found: Solution) -> Strains:
@@ -125,5 +130,5 @@ def strains(reference: Reference, found: Solution) -> Strains:
 @constant
 def _scales(grid: tuple[int, int], free: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     """What makes the scatter (3, 1) of blocks, and of rows and columns of them, that which is so for certain."""
-    sure = [1 / (1 + SURE * (2 / n) ** 0.5) for n in grid]
-    return torch.tensor([free, *sure], dtype=dtype, device=device)[:, None]
+    lines = torch.tensor(grid, dtype=dtype, device=device)
+    return torch.cat((lines.new_tensor([free]), 1 / by_chance(lines)))[:, None]

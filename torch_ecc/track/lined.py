@@ -27,8 +27,7 @@ from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.solution import Solution
-from torch_ecc.track.pinned import REACH, uncertain
-from torch_ecc.track.watch import FAR
+from torch_ecc.track.pinned import FAR, REACH, uncertain
 
 OF_LINES = 0.5  # N is so much of what white noise adds, over that noise's response to the instruments' blur
 TOLD = 0.55  # of means of BLOCK lines

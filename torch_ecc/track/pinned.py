@@ -26,9 +26,9 @@ from torch_ecc.core.pose import turn
 from torch_ecc.core.reference import Reference
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.solution import Solution
-from torch_ecc.track.watch import FAR, HEEDED
+from torch_ecc.track.watch import ELSEWHERE, HEEDED
 
-NEAR = 0.5  # px: so near the pattern is the same
+NEAR, FAR = 0.5, 3.0  # px: so near the pattern is the same, and so far it is another
 LEAST_SHARE = 0.35  # of the noise may be missing anyhow: between pixels of a frame, and where its estimate is coarse
 REACH = 2.4  # px^2
 TEXTURE = -1.0  # as a share: it is not noise
@@ -39,12 +39,12 @@ def held(estimate: Estimate, found: Solution, reference: Reference, state: Mappi
     if is_cpu(estimate.status.device) and min(estimate.status.tolist()) > Status.MAX_ITERATIONS:
         return estimate  # nothing was
     estimate, moved = pinned(estimate, reference, state), estimate.displacement.detach()
-    if is_cpu(moved.device) and all(max(abs(x), abs(y)) > FAR for x, y, _ in moved.tolist()):
+    if is_cpu(moved.device) and all(x * x + y * y > ELSEWHERE**2 for x, y, _ in moved.tolist()):
         return estimate
     off = disagreement(reference.leverage, found)
     if off is None:
         return estimate
-    near = (moved[:, :2].abs() <= FAR).all(1) & (state["heed"] != HEEDED) & Status.good(estimate.status)
+    near = (moved[:, :2].square().sum(1) <= ELSEWHERE**2) & (state["heed"] != HEEDED) & Status.good(estimate.status)
     return uncertain(estimate, torch.where(near[:, None], off, 0.0))
 
 

@@ -30,7 +30,6 @@ from torch_ecc.track.still import AROUND, BELIEVED, Still, behind
 
 HEEDED, DOUBTED = 1, 2  # of marks: the template is seen without them; they may be some
 ELSEWHERE = 2.0  # px, of its farthest pixel: what fits there has no mark in it that one does not know of
-FAR = 3.0  # px: so far from where it was cut a template has another part of the camera's fixed pattern
 FARTHER = 1.5  # times as far one looks again
 AT_ONCE = 4  # templates are looked at in one frame
 SAME, CLEARLY = 2.0, 5.0  # times its sigma a pose without marks is off where it is the same place, or another one
@@ -150,8 +149,7 @@ class Marks:
         for r in watch.due(odd, moved):
             at = torch.tensor([r], device=start.device)
             found = self.looked(self.still(at, image, start, pure[r]), at, found, estimate.at(at), moved[r])
-        near = ((pose - home)[:, :2].abs() <= FAR).all(1)  # farther off a mark shows; lines hold along one axis alone
-        near &= odd & (watch.heed == 0) & good
+        near = odd & (watch.heed == 0) & (moved <= ELSEWHERE) & good  # farther off a mark shows
         return found._replace(doubt=found.doubt + torch.where(near[:, None, None], watch.doubt, 0.0))
 
     def looked(self, still: Still, at: Tensor, found: Found, estimate: Estimate, moved: Tensor) -> Found:
