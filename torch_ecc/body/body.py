@@ -137,11 +137,13 @@ class Body(nn.Module):
         shutter, motion, good = self.tracker.shutter, None, estimate.status == Status.CONVERGED
         if estimate.pose.dim() == 3:
             motion = shutter.throughout(estimate) if shutter.line else None
-            return record(self._fused(estimate, motion, layout), good, layout, layout.start)
+            found = self._fused(estimate, motion, layout)
+            return record(found, carried(found, layout.start), good, layout)
         if shutter.line:
             motion = Motion(*(v[None] for v in shutter.newest(self.tracker._buffers)))
         found = self._fused(Estimate(*(v[None] for v in estimate)), motion, layout)
-        body = BodyEstimate(*(v[0] for v in record(found, good[None], layout, self.before)))
+        found = Fusion(*(v[0] for v in found))
+        body = record(found, torch.where((found.freedom >= 0)[:, None], found.pose, self.before), good, layout)
         self._guide(estimate, body, layout)
         return body
 
@@ -167,8 +169,16 @@ class Body(nn.Module):
     def _guide(self, estimate: Estimate, body: BodyEstimate, layout: Layout) -> None:
         """Tells the tracker where patches are that were not found, or that disagree: these ever more seldom."""
         state: Any = self._buffers
+        if bool(body.used.all()):
+            state["apart"].zero_()
+        else:
+            self._mend(estimate, body, layout, state)
+        state["found"].copy_(body.ok)
+        state["before"].copy_(body.pose)
+
+    def _mend(self, estimate: Estimate, body: BodyEstimate, layout: Layout, state: Any) -> None:
         known = body.status[layout.body] == Status.CONVERGED
-        mine = known & (layout.member.sum(0) > 0)
+        mine = known & layout.taken
         lost = mine & (estimate.status != Status.CONVERGED)
         apart = state["apart"]
         apart.copy_(torch.where(mine & ~lost & ~body.used, apart + 1, 0))
@@ -178,8 +188,6 @@ class Body(nn.Module):
             before, _ = layout.predict(state["before"][layout.body])
             step = torch.where((known & (state["found"][layout.body] > 0))[:, None], there - before, 0.0)
             self.tracker.expect(there, step, moved)
-        state["found"].copy_(body.ok)
-        state["before"].copy_(body.pose)
 
 
 def layout_of(tracker: Tracker, groups: Sequence[Sequence[int]], lens: Lens | None) -> Layout:
@@ -189,14 +197,20 @@ def layout_of(tracker: Tracker, groups: Sequence[Sequence[int]], lens: Lens | No
     return Layout.behind(lens, tracker.start, groups, Response.of(tracker.references[0]))
 
 
-def record(found: Fusion, good: Tensor, layout: Layout, last: Tensor) -> BodyEstimate:
-    """The record of F frames with ``good`` (F, R) patches; ``last`` (G, 3): where bodies were before."""
+def carried(found: Fusion, start: Tensor) -> Tensor:
+    """Poses (F, G, 3) of bodies in the frames of a track, where nothing was found those of the frame before, and
+    ``start`` (G, 3) before the first one."""
     ok = found.freedom >= 0
     number = torch.where(ok, torch.arange(len(ok), device=ok.device)[:, None], -1).cummax(0).values
     kept = found.pose.gather(0, number.clamp(min=0)[..., None].expand_as(found.pose))
-    pose = torch.where((number >= 0)[..., None], kept, last)
+    return torch.where((number >= 0)[..., None], kept, start)
+
+
+def record(found: Fusion, pose: Tensor, good: Tensor, layout: Layout) -> BodyEstimate:
+    """The record of what was ``found`` in a frame, or in F, with poses (..., G, 3) and ``good`` (..., R) patches."""
+    ok = found.freedom >= 0
     covariance = torch.where(ok[..., None, None], found.covariance, unknown(found.covariance))
-    residual = torch.where((good & (layout.member.sum(0) > 0))[..., None], found.residual, torch.nan)
+    residual = torch.where((good & layout.taken)[..., None], found.residual, torch.nan)
     status = torch.where(ok, int(Status.CONVERGED), int(Status.LOST)).to(torch.int8)
     used = found.weight >= USED
     moved = pose - layout.start

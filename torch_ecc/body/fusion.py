@@ -44,16 +44,30 @@ class Patches(NamedTuple):
     @staticmethod
     def of(pose: Tensor, covariance: Tensor, good: Tensor) -> Patches:
         """Of poses (N, R, 3) with covariances (N, R, 3, 3), those that are ``good`` (N, R) bool."""
-        known = good & covariance.isfinite().all(-1).all(-1) & pose.isfinite().all(-1)
+        known = good & (covariance.sum((-1, -2)) + pose.sum(-1)).isfinite()
         one = torch.eye(3, dtype=pose.dtype, device=pose.device)
         precision, info = torch.linalg.inv_ex(torch.where(known[..., None, None], covariance, one))
         known = known & (info == 0) & (precision.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
         return Patches(torch.where(known[..., None], pose, 0.0), precision, known.to(pose.dtype))
 
+    def counting(self, layout: Layout) -> Counting:
+        """What makes their normal equations."""
+        nothing = layout.gather(self.weight[..., None]) <= 0
+        one = torch.eye(3, dtype=self.pose.dtype, device=self.pose.device)
+        return Counting(self.precision * self.weight[..., None, None], nothing[..., None] * one)
+
     def falling(self, distance: Tensor, scale: Tensor | float = 1.0) -> Patches:
         """These, believed the less the larger the squared ``distance`` (..., R) over its ``scale`` (..., 1)."""
         share = ((DISAGREES - distance / scale) / (DISAGREES - AGREES)).clamp(0, 1).square()
         return self._replace(weight=self.weight * share)
+
+
+class Counting(NamedTuple):
+    """Of R patches of G bodies the ``precision`` (..., R, 3, 3) times the weight, and ``unseen`` (..., G, 3, 3), what
+    the normal matrix of a body has of which nothing is seen, so that it stays where it is: one, of others zero."""
+
+    precision: Tensor
+    unseen: Tensor
 
 
 class Fusion(NamedTuple):
@@ -75,7 +89,7 @@ def fuse(pose: Tensor, covariance: Tensor, good: Tensor, layout: Layout) -> Fusi
 
     On any device; patches that are not good, or in no body, count nothing.
     """
-    patches = Patches.of(pose, covariance, good & (layout.member.sum(0) > 0))
+    patches = Patches.of(pose, covariance, good & layout.taken)
     start = middle(layout.bodies(patches.pose), patches.weight, layout)
     found = fitted(patches, layout, start, STEPS)
     if bool((found.distance * found.weight > AGREES).any()):
@@ -102,22 +116,22 @@ def middle(bodies: Tensor, weight: Tensor, layout: Layout) -> Tensor:
 
 def fitted(patches: Patches, layout: Layout, pose: Tensor, steps: int) -> Fusion:
     """Least squares with the patches' weights, from ``pose`` (N, G, 3) on."""
-    weight, units = patches.weight[..., None], _units(layout)
+    units, counting = layout.units, patches.counting(layout)
     for _ in range(steps):
         there, slope = layout.predict(pose[..., layout.body, :])
-        step, normal = _step(wrapped(patches.pose - there), slope, patches, layout)
+        step, normal = _step(wrapped(patches.pose - there), slope, counting, layout)
         pose = pose + step / units
     there, _ = layout.predict(pose[..., layout.body, :])
     residual = wrapped(patches.pose - there)
-    distance = (residual[..., None, :] @ patches.precision @ residual[..., None])[..., 0, 0]
-    chi2 = layout.gather(weight * distance[..., None])[..., 0]
-    freedom = 3 * layout.gather(weight)[..., 0] - 3
+    distance = ((patches.precision @ residual[..., None])[..., 0] * residual).sum(-1)
+    chi2, count = layout.gather(torch.stack((patches.weight * distance, patches.weight), -1)).unbind(-1)
+    freedom = 3 * count - 3
     inverse = torch.linalg.inv_ex(normal)[0]
     scale = units[:, :, None] * units[:, None]
     covariance = inverse / scale
     excess = chi2 > _beyond(freedom, INFLATED)
     if bool(excess.any()):
-        pulled = weight * (slope.mT @ patches.precision @ residual[..., None])[..., 0]
+        pulled = (slope.mT @ (counting.precision @ residual[..., None]))[..., 0]
         meat = layout.gather((pulled[..., :, None] * pulled[..., None, :]).flatten(-2)).unflatten(-1, (3, 3))
         spread = _spread(normal, inverse @ meat @ inverse, chi2, freedom)
         covariance = torch.where(excess[..., None, None], spread / scale, covariance)
@@ -135,22 +149,12 @@ def _spread(normal: Tensor, sandwich: Tensor, chi2: Tensor, freedom: Tensor) -> 
     return torch.where((patches >= MANY)[..., None, None], sandwich, plain)
 
 
-def _step(residual: Tensor, slope: Tensor, patches: Patches, layout: Layout) -> tuple[Tensor, Tensor]:
+def _step(residual: Tensor, slope: Tensor, counting: Counting, layout: Layout) -> tuple[Tensor, Tensor]:
     """A Gauss-Newton step (..., G, 3) in the units of ``slope``, and the normal matrix (..., G, 3, 3)."""
-    pulled = slope.mT @ patches.precision
-    sums = torch.cat((pulled @ slope, pulled @ residual[..., None]), -1) * patches.weight[..., None, None]
-    total = layout.gather(sums.flatten(-2)).unflatten(-1, (3, 4))
-    normal = total[..., :3]
-    alone = (normal.diagonal(dim1=-2, dim2=-1) <= 0).any(-1)  # a body of which nothing is seen stays where it is
-    one = torch.eye(3, dtype=normal.dtype, device=normal.device)
-    normal = torch.where(alone[..., None, None], one, normal)
+    pulls = slope.mT @ (counting.precision @ torch.cat((slope, residual[..., None]), -1))
+    total = layout.gather(pulls.flatten(-2)).unflatten(-1, (3, 4))
+    normal = total[..., :3] + counting.unseen
     return torch.linalg.solve_ex(normal, total[..., 3:])[0][..., 0], normal
-
-
-def _units(layout: Layout) -> Tensor:
-    """By what x, y and theta are counted, (G, 3)."""
-    one = torch.ones_like(layout.reach)
-    return torch.stack((one, one, layout.reach), -1)
 
 
 def _beyond(freedom: Tensor, sigmas: float) -> Tensor:
@@ -204,8 +208,8 @@ def _agreeing(each: Patches, layout: Layout, pose: Tensor, own: Tensor, tried: T
 def _refit(patches: Patches, layout: Layout, pose: Tensor) -> tuple[Tensor, Tensor]:
     """A step of ``pose`` (..., 1, 3), and the squared distances (..., n) of the patches from there."""
     there, slope = layout.predict(pose.expand(*pose.shape[:-2], patches.weight.shape[-1], 3))
-    step, _ = _step(wrapped(patches.pose - there), slope, patches, layout)
-    pose = pose + step / _units(layout)
+    step, _ = _step(wrapped(patches.pose - there), slope, patches.counting(layout), layout)
+    pose = pose + step / layout.units
     there, _ = layout.predict(pose.expand_as(there))
     residual = wrapped(patches.pose - there)[..., None]
     return pose, (residual.mT @ patches.precision @ residual)[..., 0, 0]

@@ -49,14 +49,23 @@ class View(NamedTuple):
 class Layout(NamedTuple):
     """R patches of G bodies: the ``place`` (R, 3) of each in its body, which ``body`` (R,) it is a part of, 0 for none;
     whether it is (G, R) as 0 and 1, ``member``; where the bodies ``start`` (G, 3) and how far patches are from there,
-    ``reach`` (G,) px, rms; the ``view`` if there is a lens before them."""
+    ``reach`` (G,) px, rms; by what x, y and theta of bodies are counted, ``units`` (G, 3); how places turn with cos and
+    sin of their body's angle, and the slope of that in these units, ``turning`` (R, 6, 3); the ``view`` if there is a
+    lens before them."""
 
     place: Tensor
     body: Tensor
     member: Tensor
     start: Tensor
     reach: Tensor
+    units: Tensor
+    turning: Tensor
     view: View | None = None
+
+    @property
+    def taken(self) -> Tensor:
+        """Which patches are part of a body: (R,) bool."""
+        return self.member.any(0)
 
     @staticmethod
     def of(start: Tensor, groups: Sequence[Sequence[int]]) -> Layout:
@@ -73,8 +82,9 @@ class Layout(NamedTuple):
         origin = torch.cat((member @ start[:, :2] / count, angle), 1)
         body = member.argmax(0)
         place = compose(inverse(origin)[body], start)
-        reach = (member @ place[:, :2].square().sum(1, keepdim=True) / count)[:, 0].sqrt()
-        return Layout(place, body, member, origin, reach.clamp(min=1.0))
+        reach = (member @ place[:, :2].square().sum(1, keepdim=True) / count)[:, 0].sqrt().clamp(min=1.0)
+        units = torch.stack((torch.ones_like(reach), torch.ones_like(reach), reach), 1)
+        return Layout(place, body, member, origin, reach, units, _turning(place, reach[body]))
 
     @staticmethod
     def behind(lens: Lens, start: Tensor, groups: Sequence[Sequence[int]], response: Response) -> Layout:
@@ -90,24 +100,21 @@ class Layout(NamedTuple):
     def to(self, device: torch.device) -> Layout:
         """All of it on a ``device``."""
         view = self.view and View(self.view.lens, *(v.to(device) for v in self.view[1:]))
-        place, body, member, start, reach = (v.to(device) for v in self[:5])
-        return Layout(place, body, member, start, reach, view)
+        return Layout(*(v.to(device) for v in self[:7]), view=view)
 
     def select(self, index: Tensor) -> Layout:
         """A single body of the patches at ``index`` (n,), which are its own."""
         g, view = int(self.body[index[0]]), self.view and View(self.view.lens, *(v[index] for v in self.view[1:]))
+        start, reach, units = (value[g : g + 1] for value in (self.start, self.reach, self.units))
         member = self.member.new_ones(1, len(index))
-        own = self.place[index], self.body[index] * 0, member, self.start[g : g + 1], self.reach[g : g + 1]
-        return Layout(*own, view)
+        return Layout(self.place[index], self.body[index] * 0, member, start, reach, units, self.turning[index], view)
 
     def predict(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Where patches (..., R, 3) are if their bodies are at ``pose`` (..., R, 3), and how that changes with x, y and
         theta times ``reach``: (..., R, 3, 3)."""
-        there = compose(pose, self.place.expand_as(pose))
-        arm = (there - pose)[..., :2] / self.reach[self.body][:, None]
-        slope = torch.stack((arm[..., 1], -arm[..., 0], 1 / self.reach[self.body].expand(arm.shape[:-1])), -1)
-        one = torch.eye(3, 2, dtype=pose.dtype, device=pose.device).expand(*pose.shape, 2)
-        slope = torch.cat((one, slope[..., None]), -1)
+        turned = self._turned(pose[..., 2])
+        there, one = pose + turned[..., :3, 0], torch.eye(3, 2, dtype=pose.dtype, device=pose.device)
+        slope = torch.cat((one.expand(*pose.shape, 2), turned[..., 3:, :]), -1)
         if self.view is None:
             return there, slope
         seen, lens = self.view.predict(pose)
@@ -116,7 +123,11 @@ class Layout(NamedTuple):
     def bodies(self, patch: Tensor) -> Tensor:
         """Where each patch (..., R, 3) by itself says that its body is: (..., R, 3)."""
         patch = patch if self.view is None else self.view.lens.straight_pose(patch)
-        return compose(patch, inverse(self.place).expand_as(patch))
+        return patch - self._turned(patch[..., 2] - self.place[:, 2])[..., :3, 0]
+
+    def _turned(self, theta: Tensor) -> Tensor:
+        """The places of patches in bodies turned by ``theta`` (..., R), and their slopes: (..., R, 6, 1)."""
+        return self.turning @ torch.stack((theta.cos(), theta.sin(), torch.ones_like(theta)), -1)[..., None]
 
     def gather(self, values: Tensor) -> Tensor:
         """The sum over each body's patches of ``values`` (..., R, n): (..., G, n)."""
@@ -158,6 +169,14 @@ class Response(NamedTuple):
         return Response(points.expand(count, 9, 2), torch.linalg.solve(normal, pulled.flatten(1)).expand(count, 3, 18))
 
 
+def _turning(place: Tensor, reach: Tensor) -> Tensor:
+    """Of places (R, 3), with the ``reach`` (R,) of their bodies: what makes (cos, sin, 1) of a body's angle the place
+    turned by it and the slope of that over reach, (R, 6, 3)."""
+    (x, y, theta), none, far = place.unbind(1), torch.zeros_like(reach), 1 / reach
+    rows = (x, y, none), (y, -x, none), (none, none, theta), (y * far, -x * far, none), (-x * far, -y * far, none)
+    return torch.stack([torch.stack(row, 1) for row in (*rows, (none, none, far))], 1)
+
+
 MIDDLE = 4  # of nine points
 
 
@@ -175,5 +194,5 @@ def _biquadratic(points: Tensor) -> Tensor:
 
 def wrapped(difference: Tensor) -> Tensor:
     """Differences of poses (..., 3) less whole turns."""
-    x, y, theta = difference.unbind(-1)
-    return torch.stack((x, y, theta - tau * torch.round(theta / tau)), -1)
+    theta = difference[..., 2:]
+    return torch.cat((difference[..., :2], theta - tau * torch.round(theta / tau)), -1)

@@ -41,30 +41,21 @@ def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapp
     known of them, ``lines`` (R, 2, 2) in the ``state`` of a tracker, their variance along x and y and how far off it
     was asked for, is asked for again farther off."""
     lines, moved = state["lines"], estimate.displacement.detach()[:, :2]
-    asked, pulled = due(moved.tolist(), lines.tolist()) if is_cpu(moved.device) else (True, True)
-    if asked:
-        reach, (power, before) = moved.abs().clamp(max=FARTHEST), lines.unbind(2)
+    (power, before), on_cpu, reach = lines.unbind(2), is_cpu(moved.device), moved.abs().clamp(max=FARTHEST)
+    farther = reach > torch.add(NEAREST, before, alpha=FARTHER)
+    if not on_cpu or bool(farther.any()):
         told = torch.stack([offsets(found, reference, axis) for axis in (0, 1)], 1)
         new = told / (TOLD * torch.minimum(reach, reach.square())).clamp(min=LEAST)
-        farther = Status.good(estimate.status)[:, None] & (reach > FARTHER * before + NEAREST)
+        farther = farther & Status.good(estimate.status)[:, None]
         power = torch.where(farther, torch.minimum(new, reference.blocks.lined.to(new)), power)
         lines.copy_(torch.stack((power, torch.where(farther, reach, before)), 2))
-        pulled = pulled or bool((power > 0).any())
-    if not pulled:
+    if on_cpu and not bool(power.any()):
         return estimate
     along = (turn(estimate.pose.detach()[:, 2]).mT[:, :2, :2] @ moved[:, :, None])[:, :, 0]
     near = torch.where(along.abs() <= FAR, along * (-along.square() / REACH).exp(), 0.0)
     pull = OF_LINES / reference.noise.response[:, :1] * lines[:, :, 0] * near
     off = reference.normal.inverse[:, :3, :3] @ (reference.normal.bread_bias[:, :, :2] * pull[:, None])
     return uncertain(uncertain(estimate, off[:, :, 0]), off[:, :, 1])
-
-
-def due(moved: list[list[float]], lines: list[list[list[float]]]) -> tuple[bool, bool]:
-    """Whether the host sees that ``lines`` (R, 2, 2) are to be asked for, of templates that have ``moved`` (R, 2) px,
-    and whether those that are known bear on any."""
-    each = [(abs(d), *line) for ds, two in zip(moved, lines, strict=True) for d, line in zip(ds, two, strict=True)]
-    asked = any(min(d, FARTHEST) > FARTHER * before + NEAREST for d, _, before in each)
-    return asked, any(power > 0 and d <= FAR for d, power, _ in each)
 
 
 def offsets(found: Solution, reference: Reference, axis: int) -> Tensor:

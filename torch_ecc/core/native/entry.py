@@ -15,7 +15,7 @@ from torch_ecc.core.solution import Trust
 DTYPES = (torch.uint8, torch.uint16, torch.float32)  # of images
 FIELDS = ("pose", "error", "iterations", "gain", "sums", "total", "moments")  # of answers
 CALL = Struct("@21qdq")  # Call
-PIXELS_PER_THREAD = 2**19  # some 2 ms of work
+PIXELS_PER_THREAD = 2**17  # half a millisecond of work or more
 
 How = tuple[int, int, float, int]  # degree of the spline between pixels, max_iterations, tolerance, criterion
 
