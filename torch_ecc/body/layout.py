@@ -100,7 +100,8 @@ class Layout(NamedTuple):
     def to(self, device: torch.device) -> Layout:
         """All of it on a ``device``."""
         view = self.view and View(self.view.lens, *(v.to(device) for v in self.view[1:]))
-        return Layout(*(v.to(device) for v in self[:7]), view=view)
+        place, body, member, start, reach, units, turning = (v.to(device) for v in self[:7])
+        return Layout(place, body, member, start, reach, units, turning, view)
 
     def select(self, index: Tensor) -> Layout:
         """A single body of the patches at ``index`` (n,), which are its own."""
