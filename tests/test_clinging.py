@@ -9,12 +9,12 @@ from torch import Tensor
 
 from torch_ecc import Status, align, prepare
 from torch_ecc.core.blocks import STRAINS
-from torch_ecc.core.clinging import clinging, few_lines, scale_of
+from torch_ecc.core.clinging import clinging, scale_of
 from torch_ecc.core.clinging import strains as strains_shown
 from torch_ecc.core.native.engine import solve as native
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solver import solve
-from torch_ecc.core.strain import strained_by, strained_pose, without_strain
+from torch_ecc.core.strain import few_lines, strained_by, strained_pose, without_strain
 from torch_ecc.sim import Pads, PlaneWaves
 
 SIZE, FRAME, MIDDLE = 91, (151, 160), (80.0, 75.0)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.ambient import constant
@@ -21,10 +20,9 @@ from torch_ecc.core.normal import LEAST, Normal
 from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.solution import SUMS, Solution, clustered
-from torch_ecc.core.strain import Strains, strained_by, strained_pose, strains_of, without_strain
+from torch_ecc.core.strain import Strains, by_chance, strained_by, strained_pose, strains_of, without_strain
 
 FEW_BLOCKS = 4  # blocks per fitted column below which residuals cannot tell whether they cling together
-SURE = 3.0  # standard deviations by which lines must scatter more than blocks do: lines are few, and scatter by chance
 
 
 class Clinging(NamedTuple):
@@ -97,26 +95,8 @@ def explained(residuals: Residuals, grid: tuple[int, int]) -> tuple[Tensor, Tens
         square = strain[:, :, None] * strain[:, None] + uncertain
         strained = strained_pose(strains, square * (certain / gain.to(certain).square())[:, None, None])
     scatter = ratio[:, :1].clamp(min=1.0)
-    lines = ratio * few_lines(strains.share.to(ratio.dtype), grid)
+    lines = ratio * strains.lines
     return torch.where(ratio > scatter, lines, scatter).amax(1, keepdim=True), strained
-
-
-def few_lines(share: Tensor, grid: tuple[int, int]) -> Tensor:
-    """How many times their scatter that of blocks, and of rows and columns of them, may be, (B, 3, 3), if blocks bear
-    on a pose by a ``share`` (B, 3, blocks).
-
-    The fit has made the sum of n lines zero, and an error over a scatter of so few has Student's distribution, with the
-    variance (n - 1) / (n - 3). Lines that bear little are none: n = (sum s)^2 / sum s^2 (Kish, Survey Sampling, 1965).
-    """
-    power = share.unflatten(2, grid)
-    lines = [each.sum(2).square() / each.square().sum(2).clamp(min=LEAST) for each in (power.sum(3), power.sum(2))]
-    n = torch.stack(lines, 1).clamp(min=1)
-    return F.pad(by_chance(n) * n / (n - 3).clamp(min=1), (0, 0, 1, 0), value=1.0)
-
-
-def by_chance(n: Tensor) -> Tensor:
-    """How many times the scatter of blocks that of ``n`` lines of them may be without meaning anything."""
-    return 1 + SURE * (2 / n).sqrt()
 
 
 def strains(reference: Reference, found: Solution) -> Strains:
@@ -124,7 +104,8 @@ def strains(reference: Reference, found: Solution) -> Strains:
     if found.trust is None and found.normal is reference.normal:
         return reference.strains
     share = found.sums[:, 0] / reference.parts.weight.clamp(min=LEAST)
-    return strains_of(reference.parts, found.normal, share if found.trust is None else share * found.trust)
+    counted = share if found.trust is None else share * found.trust
+    return strains_of(reference, found.normal, counted)
 
 
 @constant

@@ -124,7 +124,7 @@ class Reference(_Groups):
     @property
     def strains(self) -> Strains:
         """What they leave if it is strained: made once, if it is needed."""
-        return strains_of(self.parts, self.normal) if torch.compiler.is_compiling() else self._kept_strains
+        return strains_of(self) if torch.compiler.is_compiling() else self._kept_strains
 
     @property
     def leverage(self) -> Leverage:
@@ -150,7 +150,7 @@ class Reference(_Groups):
 
     _kept_blocks = kept(blocks_of)
     _kept_parts = kept(parts_of)
-    _kept_strains = kept(lambda reference: strains_of(reference.parts, reference.normal))
+    _kept_strains = kept(strains_of)
     _kept_leverage = kept(lambda reference: leverage_of(reference.blocks, reference.parts, reference.normal))
 
     @cached_property

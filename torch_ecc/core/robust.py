@@ -101,7 +101,9 @@ class Doubted(NamedTuple):
         return Doubted(engine, reference, image, settings, which, reference.blocks, floor, usual, last)
 
     def at(self, part: Tensor) -> Doubted:
-        """Some of them."""
+        """Some of them (n,) bool."""
+        if part.all():
+            return self
         blocks = each(lambda value: value[part], self.blocks)
         known = {name: getattr(self, name)[part] for name in ("which", "floor", "usual", "last")}
         return self._replace(blocks=blocks, **known)
@@ -145,10 +147,12 @@ def solve(
                 return found
             doubted, plain, uneven = doubted.at(~left), part_of(plain, ~left), uneven[~left]
         doubtful = torch.ones_like(uneven)
-    again = solved_again(doubted if on_cpu else doubted._replace(asked=doubtful), start, plain, uneven)
-    answer = chosen(doubtful, again, plain)
-    before = found._replace(trust=whole(found), odd=None, doubtful=None)
-    answer = each(lambda old, new: old.index_copy(0, doubted.which, new), before, answer)
+    again, taken = solved_again(doubted if on_cpu else doubted._replace(asked=doubtful), start, plain, uneven)
+    answer = found
+    if not on_cpu or taken.any():
+        new = chosen(doubtful & taken, again, plain)
+        before = found._replace(trust=whole(found), odd=None, doubtful=None)
+        answer = each(lambda old, new: old.index_copy(0, doubted.which, new), before, new)
     return answer._replace(odd=odd, doubtful=found.doubtful)
 
 
@@ -185,16 +189,17 @@ def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
     return ~(ratio <= OUTLIER).all(1)
 
 
-def solved_again(doubted: Doubted, start: Tensor, plain: Solution, uneven: Tensor) -> Solution:
-    """The best of the ``plain`` answer, whose blocks are ``uneven`` (n,), and of those that trust leads to.
+def solved_again(doubted: Doubted, start: Tensor, plain: Solution, uneven: Tensor) -> tuple[Solution, Tensor]:
+    """The best answer that trust leads to, and where (n,) it is to be taken for the ``plain`` one, whose blocks are
+    ``uneven`` (n,).
 
     Noise may have grown in all of the patch, or light be another: then least squares is right, and leaving out most of
     it is not.
     """
     score, least = correlation(plain.normal, plain.total), RECOGNISED * doubted.usual
-    best, fits = best_trial(doubted, start, plain, score >= least)
+    best, fits, other = best_trial(doubted, start, plain, score >= least)
     recognised = torch.maximum(score, detrended(plain.normal, plain.total)) >= least
-    return chosen((uneven | fits) & (covers_most(best) | ~recognised), best, plain)
+    return best, other & (uneven | fits) & (covers_most(best) | ~recognised)
 
 
 def covers_most(found: Solution) -> Tensor:
@@ -202,12 +207,13 @@ def covers_most(found: Solution) -> Tensor:
     return found.normal.total >= LEAST_COVERAGE * found.sums[:, 0].sum(1)
 
 
-def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Tensor) -> tuple[Solution, Tensor]:
-    """The best, and whether it fits (n,), of the ``plain`` answer and those that trust leads to if it begins with the
-    residuals of least squares, or with those under a median fit, at the ``start`` (B, 3) or where least squares has
-    come to, and has not slid away. Where least squares has ``recognised`` (n,) the template and the first trial is no
-    better, no other is made; where it has not, one that recognises most of the template fits."""
-    strange = ~recognised
+def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Tensor) -> tuple[Solution, Tensor, Tensor]:
+    """The best, whether it fits (n,), and whether it is another (n,), of the ``plain`` answer and those that trust
+    leads to if it begins with the residuals of least squares, or with those under a median fit, at the ``start`` (B, 3)
+    or where least squares has come to, and has not slid away. Where least squares has ``recognised`` (n,) the template
+    and the first trial is no better, no other is made; where it has not, one that recognises most of the template fits.
+    """
+    strange, other = ~recognised, torch.zeros_like(recognised)
     there = start.index_copy(0, doubted.which, plain.pose)
     here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
     variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
@@ -229,14 +235,14 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Ten
         better = torch.where(well == fits, total < least, well)  # what fits most of it, or else what leaves less
         better = torch.where(recognised, (well >= fits) & improves(left, price, share), better)
         better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
-        best, recognised = chosen(better, found, best), recognised & ~better
+        best, recognised, other = chosen(better, found, best), recognised & ~better, other | better
         if remembered:  # a cover mostly stays: what has led here in the last frame, and does so again, is enough
             recognised, remembered = recognised | better & covers_most(found), False
         left, fits = torch.where(better[:, None], price, left), torch.where(better, well, fits)
         least = torch.where(better, total, least)
         if is_cpu(start.device) and bool((fits | recognised).all()):
             break
-    return best, fits
+    return best, fits, other
 
 
 def recognises_most(doubted: Doubted, found: Solution) -> Tensor:
@@ -317,7 +323,7 @@ def chosen(better: Tensor, new: Solution, old: Solution) -> Solution:
 
 def part_of(found: Solution, some: Tensor) -> Solution:
     """That of ``some`` templates (B,) bool."""
-    return each(lambda value: value[some], found)
+    return found if some.all() else each(lambda value: value[some], found)
 
 
 def whole(found: Solution) -> Tensor:

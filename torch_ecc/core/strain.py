@@ -6,17 +6,22 @@ each kind of it leaves in the blocks of a template follows from the template alo
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.ambient import constant
-from torch_ecc.core.blocks import STRAINS, Parts
+from torch_ecc.core.blocks import STRAINS
 from torch_ecc.core.criteria import safe_inverse
 from torch_ecc.core.normal import LEAST, Normal
 
+if TYPE_CHECKING:
+    from torch_ecc.core.reference import Reference
+
 LEAST_SPREAD = 0.2  # of the mean: blocks that tell next to nothing count by what they tell
+SURE = 3.0  # standard deviations by which lines must scatter more than blocks do: lines are few, and scatter by chance
 BY_CHANCE = 14.0  # so large may the square of 7 strains over its variance be by chance
 
 
@@ -24,17 +29,18 @@ class Strains(NamedTuple):
     """Of B templates: the ``pattern`` (B, 7, 3 blocks) that each of ``STRAINS`` leaves in every block under a gain of
     1, as a pose feels it; the ``fit`` (B, 7, 3 blocks) that takes such an effect to the strains that it is of, by least
     squares over what white noise leaves there; by what they ``shift`` the pose, (B, 3, 7), and the ``radius`` (B,); and
-    by how much each block bears on the pose, ``share`` (B, 3, blocks)."""
+    how many times that of blocks the scatter of so few ``lines`` (B, 3, 3) may be, see ``few_lines``."""
 
     pattern: Tensor
     fit: Tensor
     shift: Tensor
     radius: Tensor
-    share: Tensor
+    lines: Tensor
 
 
-def strains_of(parts: Parts, normal: Normal, share: Tensor | None = None) -> Strains:
+def strains_of(reference: Reference, normal: Normal | None = None, share: Tensor | None = None) -> Strains:
     """Of templates whose blocks count by a ``share`` (B, blocks), which the ``normal`` equations are about."""
+    parts, normal = reference.parts, reference.normal if normal is None else normal
     if share is not None:
         share = share[:, None, None]
         parts = parts._replace(normal=parts.normal * share, strain=parts.strain * share)
@@ -47,7 +53,25 @@ def strains_of(parts: Parts, normal: Normal, share: Tensor | None = None) -> Str
     pattern = torch.einsum("bkp,bpmn->bmkn", rows, left).flatten(2)
     weighted = pattern / spread.clamp(min=LEAST).flatten(1).unsqueeze(1)
     fit = safe_inverse(weighted @ pattern.mT)[0] @ weighted
-    return Strains(pattern, fit, shift[:, :3], parts.radius, power)
+    return Strains(pattern, fit, shift[:, :3], parts.radius, few_lines(power.to(inverse.dtype), reference.grid.blocks))
+
+
+def few_lines(share: Tensor, grid: tuple[int, int]) -> Tensor:
+    """How many times their scatter that of blocks, and of rows and columns of them, may be, (B, 3, 3), if blocks bear
+    on a pose by a ``share`` (B, 3, blocks).
+
+    The fit has made the sum of n lines zero, and an error over a scatter of so few has Student's distribution, with the
+    variance (n - 1) / (n - 3). Lines that bear little are none: n = (sum s)^2 / sum s^2 (Kish, Survey Sampling, 1965).
+    """
+    power = share.unflatten(2, grid)
+    lines = [each.sum(2).square() / each.square().sum(2).clamp(min=LEAST) for each in (power.sum(3), power.sum(2))]
+    n = torch.stack(lines, 1).clamp(min=1)
+    return F.pad(by_chance(n) * n / (n - 3).clamp(min=1), (0, 0, 1, 0), value=1.0)
+
+
+def by_chance(n: Tensor) -> Tensor:
+    """How many times the scatter of blocks that of ``n`` lines of them may be without meaning anything."""
+    return 1 + SURE * (2 / n).sqrt()
 
 
 def strained_by(strains: Strains, effect: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -55,7 +55,7 @@ def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapp
     near = torch.where(along.abs() <= FAR, along * (-along.square() / REACH).exp(), 0.0)
     pull = OF_LINES / reference.noise.response[:, :1] * lines[:, :, 0] * near
     off = reference.normal.inverse[:, :3, :3] @ (reference.normal.bread_bias[:, :, :2] * pull[:, None])
-    return uncertain(uncertain(estimate, off[:, :, 0]), off[:, :, 1])
+    return uncertain(estimate, off)
 
 
 def offsets(found: Solution, reference: Reference, axis: int) -> Tensor:

@@ -45,7 +45,7 @@ def held(estimate: Estimate, found: Solution, reference: Reference, state: Mappi
     if off is None:
         return estimate
     near = (moved[:, :2].square().sum(1) <= ELSEWHERE**2) & (state["heed"] != HEEDED) & Status.good(estimate.status)
-    return uncertain(estimate, torch.where(near[:, None], off, 0.0))
+    return uncertain(estimate, torch.where(near[:, None, None], off[:, :, None], 0.0))
 
 
 def pinned(estimate: Estimate, reference: Reference, state: Mapping[str, Tensor]) -> Estimate:
@@ -64,12 +64,12 @@ def pinned(estimate: Estimate, reference: Reference, state: Mapping[str, Tensor]
     pull = known.clamp(min=0) * noise.of_frame * (-distance2 / REACH).exp()
     turned = turn(estimate.pose.detach()[:, 2]).mT @ moved[:, :, None]
     solved = reference.normal.inverse[:, :3, :3] @ (reference.normal.bread_bias @ turned)  # the first is that of S
-    return uncertain(estimate, solved[:, :, 0] * pull[:, None])
+    return uncertain(estimate, solved * pull[:, None, None])
 
 
 def uncertain(estimate: Estimate, off: Tensor) -> Estimate:
-    """The ``estimate`` (R, ...) whose poses may be ``off`` (R, 3), in the template's axes, too."""
-    there = turn(estimate.pose.detach()[:, 2]) @ off[:, :, None]
+    """The ``estimate`` (R, ...) whose poses may be off, in the template's axes, by each of k columns (R, 3, k) too."""
+    there = turn(estimate.pose.detach()[:, 2]) @ off
     return estimate._replace(covariance=estimate.covariance + (there @ there.mT).nan_to_num(0.0, 0.0, 0.0))
 
 
