@@ -387,7 +387,7 @@ def test_a_state_is_a_snapshot_only_when_copied() -> None:
 def test_a_state_from_before_is_filled() -> None:
     """That of a tracker which did not know yet of what stays with a camera."""
     tracker, twin = used(), made()
-    tracker.lines.zero_()  # it has not asked for them either
+    tracker.lines.copy_(unknown_lines(tracker.start))  # it has not asked for them either
     state = {name: part for name, part in tracker.state_dict().items() if name not in ("fixed", "doubt", "lines")}
     twin.load_state_dict(state)
     assert_goes_on_as(tracker, twin)

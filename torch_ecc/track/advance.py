@@ -14,7 +14,7 @@ from torch_ecc.core.robust import Memory
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
 from torch_ecc.track.budget import BURST
-from torch_ecc.track.lined import lined
+from torch_ecc.track.lined import lined, unknown_lines
 from torch_ecc.track.pinned import held
 
 PREDICTIONS = ("hold", "velocity")
@@ -42,7 +42,7 @@ def beginning(start: Tensor) -> dict[str, Tensor]:
         "found": none.to(torch.int8),  # by a search, 0 or 1: averages of bool fail
         "suspect_frames": none,  # in a row
         "fixed": torch.zeros_like(start[:, 0]),  # share of the noise that is the same in all frames, see ``pinned``
-        "lines": start.new_zeros(len(start), 2, 2),  # variance of offsets of columns, rows; how far off: see ``lined``
+        "lines": unknown_lines(start),
         "turn": none[0].clone(),  # (): which of many lost ones is searched for next
         "credit": start.new_tensor(BURST),  # (): for searches, in frames, see ``budget``
     }

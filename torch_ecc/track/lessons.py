@@ -25,6 +25,7 @@ from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.sampling import SAMPLERS, inside, make_sampler
 from torch_ecc.core.sight import eroded, picked
 from torch_ecc.track.ages import Places, placed
+from torch_ecc.track.lined import unknown_lines
 from torch_ecc.track.surface import Surface, news, pixels, with_contrast
 
 HIGH = 0.75  # coverage: with less a frame teaches nothing
@@ -100,7 +101,7 @@ def with_new_parts(state: dict[str, Any], prefix: str) -> None:
     if isinstance(start, Tensor) and start.dim() == 2:
         state.setdefault(f"{prefix}fixed", torch.zeros_like(start[:, 0]))
         state.setdefault(f"{prefix}doubt", start.new_zeros(len(start), 3, 3))
-        state.setdefault(f"{prefix}lines", start.new_zeros(len(start), 2, 2))
+        state.setdefault(f"{prefix}lines", unknown_lines(start))
     images, places = (f"{prefix}lesson_{name}" for name in ("older", "places"))
     older = state.get(images)
     if isinstance(older, Tensor) and older.dim() == 4 and 0 < older.shape[1] <= AGES:

@@ -32,23 +32,27 @@ from torch_ecc.track.pinned import FAR, REACH, uncertain
 OF_LINES = 0.5  # N is so much of what white noise adds, over that noise's response to the instruments' blur
 TOLD = 0.55  # of means of BLOCK lines
 NEAREST, FARTHER, FARTHEST = 0.05, 1.2, 4.0  # px, times as far, px: where it is asked for, once each
+NEVER = 1e9  # px
 SURE, FREE = 3.0, 1.8  # standard deviations, of squares of neighbours that are not free of each other
 FULL = 0.5  # of the fullest line's weight
 
 
 def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapping[str, Tensor]) -> Estimate:
     """The ``estimate`` (R, ...) of what was ``found`` in a frame, whose covariance tells of the pull of lines. What is
-    known of them, ``lines`` (R, 2, 2) in the ``state`` of a tracker, their variance along x and y and how far off it
-    was asked for, is asked for again farther off."""
+    known of them, ``lines`` (R, 2, 2) in the ``state`` of a tracker, is their variance along x and y, and how far off
+    it is to be asked for, again and again."""
     lines, moved = state["lines"], estimate.displacement.detach()[:, :2]
-    (power, before), on_cpu, reach = lines.unbind(2), is_cpu(moved.device), moved.abs().clamp(max=FARTHEST)
-    farther = reach > torch.add(NEAREST, before, alpha=FARTHER)
+    (power, due), on_cpu, reach = lines.unbind(2), is_cpu(moved.device), moved.abs()
+    farther = reach > due
     if not on_cpu or bool(farther.any()):
+        reach = reach.clamp(max=FARTHEST)
         told = torch.stack([offsets(found, reference, axis) for axis in (0, 1)], 1)
         new = told / (TOLD * torch.minimum(reach, reach.square())).clamp(min=LEAST)
         farther = farther & Status.good(estimate.status)[:, None]
         power = torch.where(farther, torch.minimum(new, reference.blocks.lined.to(new)), power)
-        lines.copy_(torch.stack((power, torch.where(farther, reach, before)), 2))
+        again = FARTHER * reach + NEAREST
+        again = torch.where(again < FARTHEST, again, NEVER)
+        lines.copy_(torch.stack((power, torch.where(farther, again, due)), 2))
     if on_cpu and not bool(power.any()):
         return estimate
     along = (turn(estimate.pose.detach()[:, 2]).mT[:, :2, :2] @ moved[:, :, None])[:, :, 0]
@@ -56,6 +60,11 @@ def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapp
     pull = OF_LINES / reference.noise.response[:, :1] * lines[:, :, 0] * near
     off = reference.normal.inverse[:, :3, :3] @ (reference.normal.bread_bias[:, :, :2] * pull[:, None])
     return uncertain(estimate, off)
+
+
+def unknown_lines(start: Tensor) -> Tensor:
+    """What is known at the ``start`` (R, 3) of lines (R, 2, 2): none, and where to ask for them."""
+    return start.new_tensor((0.0, NEAREST)).expand(len(start), 2, 2).clone()
 
 
 def offsets(found: Solution, reference: Reference, axis: int) -> Tensor:
