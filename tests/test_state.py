@@ -15,6 +15,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_avg_fn, get_ema_multi_a
 
 from torch_ecc import Status, Tracker
 from torch_ecc.sim.scene.scene import PlaneWaves
+from torch_ecc.track.lined import unknown_lines
 
 SHAPE, SIZE = (96, 112), (31, 29)
 HERE, THERE = [(40.0, 36.0), (60.4, 50.7)], [(70.0, 55.0), (33.0, 60.2)]
