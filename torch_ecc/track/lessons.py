@@ -38,6 +38,7 @@ FEWEST = 2  # frames of a round
 FEWEST_EVEN = 5  # frames that tell how it has moved in them
 CHANCE = 6.0  # over the square root of frames: so much more than noise may be noise
 SLOW = 2.0  # standard deviations of a speed that may be none
+UNSURE = 3.0  # times what renewals usually correct
 SOME = 5.0  # renewals over which what they have corrected is averaged
 
 
@@ -245,10 +246,20 @@ class Teacher:
         for _ in range(PASSES):
             right = shifted(images.flatten(0, 1)[:, None], self.interpolation, places.flatten(0, 1), about)
             found = placed(right.view_as(images), there, noise, seen.mask, seen.centre)
-            places = places + found.step.nan_to_num(0.0, 0.0, 0.0)
+            places = places + steady(found, lessons.lag[which]).nan_to_num(0.0, 0.0, 0.0)
         trust(which, places[:, -1] - off, found.covariance[:, -1], lessons)
         remember(which, images, places, there, found, lessons)
         return places[:, -1]
+
+
+def steady(found: Places, lag: Tensor) -> Tensor:
+    """The steps (n, images, 3) that are ``found``; of one that is far less certain than what renewals usually correct,
+    ``lag`` (n, 3, 3), only what is no chance. Without noise all images are lines through others, and so are places that
+    are wrong: each new one would be farther off than the last."""
+    step, of_step = found.step, found.covariance.diagonal(dim1=2, dim2=3)
+    usual = lag.diagonal(dim1=1, dim2=2)[:, None]
+    certain = (1 - of_step / step.square().clamp(min=LEAST)).clamp(min=0)
+    return torch.where((of_step > UNSURE**2 * usual) & (usual > 0), certain * step, step)
 
 
 def trust(which: Tensor, step: Tensor, covariance: Tensor, lessons: Lessons) -> None:
