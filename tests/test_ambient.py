@@ -259,6 +259,32 @@ def test_autocast_goes_on_behind_a_door() -> None:
         assert (square @ square).dtype == torch.bfloat16
 
 
+@pytest.mark.parametrize("name", ["align", "locate", "Body"])
+def test_what_is_small_is_done_by_one_thread(monkeypatch, name):
+    """Others would spin at the end of each small operation: with a core that is busy it takes as long as a time slice.
+    Told by what all of them do in the end."""
+    scene = PlaneWaves.random(seed=3)
+    frame = scene.render(torch.tensor([[60.0, 60.0, 0.0]]), (120, 120))[0, 0]
+    tracker, seen, before = te.Tracker(frame, [(40.0, 60.0), (80.0, 60.0)], 31), [], torch.get_num_threads()
+    body, reference = te.Body(tracker), te.prepare(frame[45:76, 25:56][None, None])
+    calls = {
+        "align": lambda: te.align(reference, frame[None, None], torch.tensor([[40.0, 60.0, 0.0]]).double()),
+        "locate": lambda: te.locate(reference, frame[None, None]),
+        "Body": lambda: body(tracker(frame)),
+    }
+    inside = {"align": ("core.align", "solve"), "locate": ("search.locate", "_best_two"), "Body": ("body.body", "fuse")}
+    module, last = importlib.import_module(f"torch_ecc.{inside[name][0]}"), inside[name][1]
+    inner = getattr(module, last)
+    monkeypatch.setattr(module, last, lambda *args: (seen.append(torch.get_num_threads()), inner(*args))[1])
+    torch.set_num_threads(2)
+    try:
+        calls[name]()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert set(seen) == {1}
+
+
 @pytest.mark.parametrize("wanted", [1, 2])
 def test_the_number_of_threads_is_the_callers(wanted):
     """A frame is tracked on as many as it is worth, and its caller's number is there again, whatever happens."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torch_ecc.body.fusion import Fusion, fuse
 from torch_ecc.body.layout import Layout, Response
-from torch_ecc.core.ambient import plain, unrecorded
+from torch_ecc.core.ambient import plain, threads_for, unrecorded
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.pose import compose, inverse, rotation
 from torch_ecc.core.reference import MARGIN
@@ -134,6 +134,10 @@ class Body(nn.Module):
         layout = self._layout(estimate.pose.device)
         if estimate.pose.shape[-2:] != layout.place.shape:
             raise ValueError(f"Body: estimate must be of {len(layout.place)} patches, got {tuple(estimate.pose.shape)}")
+        with threads_for(estimate.covariance.numel()):
+            return self._forward(estimate, layout)
+
+    def _forward(self, estimate: Estimate, layout: Layout) -> BodyEstimate:
         shutter, motion, good = self.tracker.shutter, None, estimate.status == Status.CONVERGED
         if estimate.pose.dim() == 3:
             motion = shutter.throughout(estimate) if shutter.line else None

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core import fused, implicit, robust, sight, solver
-from torch_ecc.core.ambient import plain
+from torch_ecc.core.ambient import plain, threads_for
 from torch_ecc.core.estimate import Estimate
 from torch_ecc.core.frame import as_image, require_tensor
 from torch_ecc.core.native import engine as native
@@ -38,6 +38,13 @@ def align(
     if not isinstance(reference, Reference):
         raise ValueError(f"align: reference must come from prepare, got {type(reference).__name__}")
     settings: Settings = settings_of("align", options)
+    if torch.compiler.is_compiling():
+        return _align(reference, image, pose, settings)
+    with threads_for(len(reference.K) * reference.K.shape[2]):
+        return _align(reference, image, pose, settings)
+
+
+def _align(reference: Reference, image: Tensor, pose: Tensor, settings: Settings) -> Estimate:
     gray = as_image("align", "image", image)
     pose = require_tensor("align", "pose", pose)
     b, device = len(reference.K), reference.K.device

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_ecc.core.align import engine_for, solve
-from torch_ecc.core.ambient import lasting, plain
+from torch_ecc.core.ambient import lasting, plain, threads_for
 from torch_ecc.core.criteria import centred, safe_inverse
 from torch_ecc.core.estimate import Estimate, Origin, Status
 from torch_ecc.core.filters import downsample
@@ -90,8 +90,10 @@ def locate(
     if not isinstance(reference, Reference):
         raise ValueError(f"locate: reference must come from prepare, got {type(reference).__name__}")
     settings = Settings.of("locate", {"min_visible": LEAST_VISIBLE, **options})
-    gray = as_gray("locate", "image", image)
-    return Locator(reference, (gray.shape[-2], gray.shape[-1]), settings)(gray)
+    with threads_for(1):
+        gray = as_gray("locate", "image", image)
+        locator = Locator(reference, (gray.shape[-2], gray.shape[-1]), settings)
+    return locator(gray)
 
 
 class Locator:
@@ -134,6 +136,10 @@ class Locator:
     def __call__(self, image: Tensor, near: Tensor | None = None) -> Located:
         """The templates in ``image``, (1 or B, 1, H, W) or as the tracker takes it, of the locator's size; of places
         that are as good the one nearest to ``near`` (B, 2 or 3), px (and rad), if that is given."""
+        with threads_for(self.frame[0] * self.frame[1]):
+            return self._located(image, near)
+
+    def _located(self, image: Tensor, near: Tensor | None) -> Located:
         gray = as_gray("locate", "image", image)
         count, device = len(self.banks), self.banks[0].angles.device
         if gray.shape[-2:] != self.frame or len(gray) not in (1, count):
