@@ -110,6 +110,30 @@ def test_a_frame_that_drifts_is_one_of_the_bodies():
     assert not found.still
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("rogues", [2, 10, 30])
+def test_a_patch_whose_angle_is_not_known_hides_no_small_body(seed, rogues):
+    """It explains whatever is far enough from it, as what goes its own way: neither is a body."""
+    g, frames = torch.Generator().manual_seed(seed), 30
+    place = torch.rand(19 + rogues, 2, generator=g).double() * 600
+    place[16:19] = 270 + place[16:19] / 10
+    time = torch.linspace(0, 2 * math.pi, frames, dtype=torch.float64)
+    start, none = torch.nn.functional.pad(place, (0, 1)), torch.zeros_like(time)
+    large = torch.stack((6 * time.sin(), 3 * time.sin(), 0.05 * time.sin()), 1)
+    small = torch.stack((none, 2 * (1 - time.cos()), none), 1)
+    pose = compose(large[:, None].expand(-1, len(start), 3), start.expand(frames, -1, 3))
+    pose[:, 16:19] = compose(small[:, None].expand(-1, 3, 3), start[16:19].expand(frames, -1, 3))
+    ways = torch.randn(frames, rogues, 2, generator=g).double().cumsum(0) * 0.3
+    pose[:, 19:] = start[19:] + torch.nn.functional.pad(ways - ways[:1], (0, 1))
+    sigma = torch.tensor([0.005, 0.005, 2e-4], dtype=torch.float64)
+    pose = pose + sigma * torch.randn(pose.shape, generator=g, dtype=torch.float64)
+    covariance = torch.diag(sigma.square()).repeat(frames, len(start), 1, 1)
+    covariance[:, 19, 2, 2] = 0.3**2
+    none, codes = torch.zeros_like(pose[..., 0]), torch.zeros_like(pose[..., 0], dtype=torch.int8)
+    track = Track(*Estimate(pose, pose - start, none, codes, codes, covariance, none, codes, none, codes))
+    assert rigid_groups(track, 2).groups[:2] == [list(range(16)), [16, 17, 18]]
+
+
 def test_wrong_calls():
     track, _ = scene()
     for call, message in (

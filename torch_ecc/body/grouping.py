@@ -25,6 +25,7 @@ SLACK = (0.05, 0.004)  # px, rad: errors of real patches that their covariances 
 RELATIVE = 0.03  # and share of the way that patches have gone: lenses, and heights, show some of them larger
 EXPLAINED = 8.0  # mean of squared distances, two components of which would be chance
 FARTHEST = 60.0  # squared distances count so much at most: a frame that went wrong is no other body
+UNKNOWN = (12.0, FARTHEST)  # what a patch counts that nothing explains so far; where nothing is found so, more
 ROUNDS = 6
 HYPOTHESES, AT_ONCE = 160, 16  # patches whose own motion is tried for a body
 
@@ -76,11 +77,12 @@ def rigid_groups(track: Estimate, bodies: int) -> Groups:
         raise ValueError(f"rigid_groups: bodies must be a whole number of at least 1, got {bodies!r}")
     seen = _sampled(track)
     usable, standing, found = seen.good.sum(0) >= FEWEST_FRAMES, _still(seen), list[Tensor]()
-    known = _misfit(seen, standing)[0].clamp(max=FARTHEST)  # by what there is so far
+    known = _misfit(seen, standing)[0][0].clamp(max=FARTHEST)  # by what there is so far
     still = int(((known < EXPLAINED) & usable).sum()) >= FEWEST
     known = known if still else torch.full_like(known, FARTHEST)
     while len(found) < bodies:
-        members = _largest(seen, usable & (known >= EXPLAINED), known)
+        free = usable & (known >= EXPLAINED)
+        members = next((m for most in UNKNOWN if (m := _largest(seen, free, known.clamp(max=most))) is not None), None)
         if members is None:
             break
         found.append(members)
@@ -128,9 +130,10 @@ def _of_members(seen: _Seen, members: Tensor) -> _Motion:
     return _Motion(pose, place, spread[..., 2, 2], found.pose[..., :2], known)
 
 
-def _misfit(seen: _Seen, motion: _Motion) -> Tensor:
+def _misfit(seen: _Seen, motion: _Motion) -> tuple[Tensor, Tensor]:
     """How badly motions explain patches: the mean squared distance (H, R) over the frames in which both are known,
-    infinite where these are few."""
+    infinite where these are few; and how vague they are, (H, R): the logarithm of the variance with which they expect
+    a patch, over that of the patch. The sum is what the likelihood loses."""
     there = torch.cat(
         (
             transform(motion.pose, seen.start[:, :2]),
@@ -140,35 +143,59 @@ def _misfit(seen: _Seen, motion: _Motion) -> Tensor:
     )  # (F, H, R, 3)
     off = wrapped(seen.pose[:, None] - there)
     arm = (there[..., :2] - motion.at[:, :, None]).square().sum(-1)
-    place = seen.place[:, None] + motion.place[..., None] + arm * motion.angle[..., None]
-    angle = seen.angle[:, None] + motion.angle[..., None]
-    distance = off[..., :2].square().sum(-1) / place + off[..., 2].square() / angle
+    place, angle = seen.place[:, None], seen.angle[:, None]
+    wide = place + motion.place[..., None] + arm * motion.angle[..., None]
+    turned = angle + motion.angle[..., None]
+    distance = off[..., :2].square().sum(-1) / wide + off[..., 2].square() / turned
+    vague = 2 * (wide / place).log() + (turned / angle).log()
     both = (seen.good[:, None] & motion.known[..., None]).to(distance.dtype)
     count = both.sum(0)
-    mean = (distance.clamp(max=FARTHEST) * both).sum(0) / count.clamp(min=1)
-    return torch.where(count >= FEWEST_FRAMES, mean, torch.inf)
+    misfit, vague = ((v * both).sum(0) / count.clamp(min=1) for v in (distance.clamp(max=FARTHEST), vague))
+    return torch.where(count >= FEWEST_FRAMES, misfit, torch.inf), vague
 
 
 def _largest(seen: _Seen, free: Tensor, known: Tensor) -> Tensor | None:
     """The ``free`` patches (R,) that one motion explains, (R,) bool: the one by which most is explained better than it
-    is ``known`` (R,); None if there are no two."""
-    best, most = None, 0.0
+    is ``known`` (R,); None if there are no two.
+
+    A patch whose angle is uncertain explains nearly all that is far from it, until those tell their common motion
+    themselves. So what is expected too vaguely is not explained, and motions are compared after they are refitted, in
+    the order of what they promised, as long as one promises more than the best has kept.
+    """
     patches = free.nonzero()[:, 0]
     spread = torch.linspace(0, len(patches) - 1, min(HYPOTHESES, len(patches)), device=patches.device).round().long()
+    promise, explained, best, most = torch.zeros_like(known), torch.zeros_like(free), None, 0.0
     for some in patches[spread].split(AT_ONCE) if len(patches) else ():
-        misfit = _misfit(seen, _of_patches(seen, some))
-        explained = (misfit < EXPLAINED) & free
-        value, which = ((known - misfit).clamp(min=0) * explained).sum(1).max(0)
-        if float(value) > most and int(explained[which].sum()) >= FEWEST:
-            best, most = explained[which], float(value)
-    for _ in range(ROUNDS):
-        if best is None:
-            return None
-        again = (_misfit(seen, _of_members(seen, best))[0] < EXPLAINED) & free
-        if int(again.sum()) < FEWEST or bool((again == best).all()):
+        promise[some] = _gained(*_misfit(seen, _of_patches(seen, some)), free, known)[0]
+    for r in promise.argsort(descending=True).tolist():
+        if float(promise[r]) <= most:
             break
-        best = again
+        if not explained[r]:  # by a motion that was refitted, so that its own is the same
+            gain, members = _refitted(seen, _of_patches(seen, patches.new_tensor([r])), free, known)
+            explained |= members
+            best, most = (members, gain) if gain > most else (best, most)
     return best
+
+
+def _gained(misfit: Tensor, vague: Tensor, free: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """What motions (H,) explain better than it is ``known`` in all, and which patches, (H, R); nothing of less than
+    two."""
+    explained = (misfit < EXPLAINED) & (misfit + vague < known) & free
+    value = ((known - misfit - vague).clamp(min=0) * explained).sum(1)
+    return torch.where(explained.sum(1) >= FEWEST, value, 0.0), explained
+
+
+def _refitted(seen: _Seen, motion: _Motion, free: Tensor, known: Tensor) -> tuple[float, Tensor]:
+    """From a ``motion`` that of what it explains, until that is the same: its gain, and which (R,)."""
+    gain, members = _gained(*_misfit(seen, motion), free, known)
+    for _ in range(ROUNDS):
+        if not float(gain):
+            break
+        last = members
+        gain, members = _gained(*_misfit(seen, _of_members(seen, last[0])), free, known)
+        if bool((members == last).all()):
+            break
+    return float(gain), members[0]
 
 
 def _competing(seen: _Seen, found: list[Tensor], standing: _Motion | None) -> Groups:
@@ -176,7 +203,7 @@ def _competing(seen: _Seen, found: list[Tensor], standing: _Motion | None) -> Gr
     usable, last = seen.good.sum(0) >= FEWEST_FRAMES, None
     for _ in range(ROUNDS):
         motions = [_of_members(seen, members) for members in found] + ([] if standing is None else [standing])
-        misfit, owner = torch.cat([_misfit(seen, motion) for motion in motions]).min(0)
+        misfit, owner = torch.cat([_misfit(seen, motion)[0] for motion in motions]).min(0)
         owner = torch.where((misfit < EXPLAINED) & usable, owner, -1)
         if last is not None and bool((owner == last).all()):
             break
