@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_ecc.body.fusion import fuse
 from torch_ecc.body.layout import Layout, wrapped
-from torch_ecc.core.ambient import plain
+from torch_ecc.core.ambient import plain, threads_for
 from torch_ecc.core.estimate import Estimate, Status
 from torch_ecc.core.pose import compose, inverse, transform
 
@@ -25,7 +25,7 @@ SLACK = (0.05, 0.004)  # px, rad: errors of real patches that their covariances 
 RELATIVE = 0.03  # and share of the way that patches have gone: lenses, and heights, show some of them larger
 EXPLAINED = 8.0  # mean of squared distances, two components of which would be chance
 FARTHEST = 60.0  # squared distances count so much at most: a frame that went wrong is no other body
-UNKNOWN = (12.0, FARTHEST)  # what a patch counts that nothing explains so far; where nothing is found so, more
+UNKNOWN = 12.0  # what a patch counts that nothing explains so far
 ROUNDS = 6
 HYPOTHESES, AT_ONCE = 160, 16  # patches whose own motion is tried for a body
 
@@ -75,14 +75,18 @@ def rigid_groups(track: Estimate, bodies: int) -> Groups:
         raise ValueError(f"rigid_groups: track must be (F, R, ...), got {tuple(track.pose.shape)}")
     if not isinstance(bodies, int) or bodies < 1:
         raise ValueError(f"rigid_groups: bodies must be a whole number of at least 1, got {bodies!r}")
-    seen = _sampled(track)
+    with threads_for(1):  # thousands of operations, none of which is long
+        return _grouped(_sampled(track), bodies)
+
+
+def _grouped(seen: _Seen, bodies: int) -> Groups:
+    """Of all that is ``seen``: body after body, then all at once."""
     usable, standing, found = seen.good.sum(0) >= FEWEST_FRAMES, _still(seen), list[Tensor]()
     known = _misfit(seen, standing)[0][0].clamp(max=FARTHEST)  # by what there is so far
     still = int(((known < EXPLAINED) & usable).sum()) >= FEWEST
     known = known if still else torch.full_like(known, FARTHEST)
     while len(found) < bodies:
-        free = usable & (known >= EXPLAINED)
-        members = next((m for most in UNKNOWN if (m := _largest(seen, free, known.clamp(max=most))) is not None), None)
+        members = _next(seen, usable & (known >= EXPLAINED), known)
         if members is None:
             break
         found.append(members)
@@ -154,13 +158,25 @@ def _misfit(seen: _Seen, motion: _Motion) -> tuple[Tensor, Tensor]:
     return torch.where(count >= FEWEST_FRAMES, misfit, torch.inf), vague
 
 
+def _next(seen: _Seen, free: Tensor, known: Tensor) -> Tensor | None:
+    """Of the ``free`` patches (R,) those of a body (R,) bool, None if there is none: as single patches lead to it that
+    expect the others sharply, or vaguely, as where they are far apart; what is sharper in the end."""
+    sharp, best, most = known.clamp(max=UNKNOWN), None, 0.0
+    for counted in (sharp, known):
+        members = _largest(seen, free, counted)
+        if members is not None:
+            gain = float(_gained(*_misfit(seen, _of_members(seen, members)), members, sharp)[0])
+            best, most = (members, gain) if gain > most else (best, most)
+    return best
+
+
 def _largest(seen: _Seen, free: Tensor, known: Tensor) -> Tensor | None:
     """The ``free`` patches (R,) that one motion explains, (R,) bool: the one by which most is explained better than it
     is ``known`` (R,); None if there are no two.
 
     A patch whose angle is uncertain explains nearly all that is far from it, until those tell their common motion
-    themselves. So what is expected too vaguely is not explained, and motions are compared after they are refitted, in
-    the order of what they promised, as long as one promises more than the best has kept.
+    themselves. So motions are compared after they are refitted, in the order of what they promised, as long as one
+    promises more than the best has kept.
     """
     patches = free.nonzero()[:, 0]
     spread = torch.linspace(0, len(patches) - 1, min(HYPOTHESES, len(patches)), device=patches.device).round().long()
@@ -203,7 +219,8 @@ def _competing(seen: _Seen, found: list[Tensor], standing: _Motion | None) -> Gr
     usable, last = seen.good.sum(0) >= FEWEST_FRAMES, None
     for _ in range(ROUNDS):
         motions = [_of_members(seen, members) for members in found] + ([] if standing is None else [standing])
-        misfit, owner = torch.cat([_misfit(seen, motion)[0] for motion in motions]).min(0)
+        each, vague = (torch.cat(part) for part in zip(*(_misfit(seen, motion) for motion in motions), strict=True))
+        misfit, owner = each.masked_fill(each + vague >= UNKNOWN, torch.inf).min(0)
         owner = torch.where((misfit < EXPLAINED) & usable, owner, -1)
         if last is not None and bool((owner == last).all()):
             break
