@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from crowds import Crowd
 from torch import Tensor
 
 from torch_ecc import Estimate, Status, Track, rigid_groups, rotation_centre
@@ -133,6 +134,13 @@ def test_a_patch_whose_angle_is_not_known_hides_no_small_body(seed, wide, rogues
     none, codes = torch.zeros_like(pose[..., 0]), torch.zeros_like(pose[..., 0], dtype=torch.int8)
     track = Track(*Estimate(pose, pose - start, none, codes, codes, covariance, none, codes, none, codes))
     assert rigid_groups(track, 2).groups[:2] == [list(range(16)), [16, 17, 18]]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_bodies_are_put_together_whatever_they_are(seed):
+    """Few or many, small or all over the view, with strays and lost frames between them."""
+    crowd = Crowd.drawn(seed)
+    assert crowd.right(rigid_groups(crowd.track, crowd.bodies)) > 0.97
 
 
 def test_wrong_calls():
