@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from crowds import Crowd
+from crowds import Crowd, Draw
 from torch import Tensor
 
 from torch_ecc import Estimate, Status, Track, rigid_groups, rotation_centre
@@ -141,6 +141,15 @@ def test_bodies_are_put_together_whatever_they_are(seed):
     """Few or many, small or all over the view, with strays and lost frames between them."""
     crowd = Crowd.drawn(seed)
     assert crowd.right(rigid_groups(crowd.track, crowd.bodies)) > 0.97
+
+
+def test_strays_alone_are_no_body():
+    """Neither are two that agree by chance."""
+    draw = Draw(torch.Generator().manual_seed(0))
+    start = draw.places(60, 2000.0, 2000.0)
+    steps = draw.normal(40, 60, 3) * torch.tensor([0.5, 0.5, 0.002], dtype=torch.float64)
+    with pytest.raises(ValueError, match="no two patches move together"):
+        rigid_groups(draw.seen(start + steps.cumsum(0) - steps[:1], start), 3)
 
 
 def test_wrong_calls():

@@ -28,6 +28,7 @@ FARTHEST = 60.0  # squared distances count so much at most: a frame that went wr
 UNKNOWN = 12.0  # what a patch counts that nothing explains so far
 ROUNDS = 6
 HYPOTHESES, AT_ONCE = 160, 16  # patches whose own motion is tried for a body
+REFITTED = 12  # of these motions at most
 
 
 class Groups(NamedTuple):
@@ -76,7 +77,10 @@ def rigid_groups(track: Estimate, bodies: int) -> Groups:
     if not isinstance(bodies, int) or bodies < 1:
         raise ValueError(f"rigid_groups: bodies must be a whole number of at least 1, got {bodies!r}")
     with threads_for(1):  # thousands of operations, none of which is long
-        return _grouped(_sampled(track), bodies)
+        found = _grouped(_sampled(track), bodies)
+    if not found.groups:
+        raise ValueError("rigid_groups: no two patches move together")
+    return found
 
 
 def _grouped(seen: _Seen, bodies: int) -> Groups:
@@ -91,8 +95,6 @@ def _grouped(seen: _Seen, bodies: int) -> Groups:
             break
         found.append(members)
         known = torch.minimum(known, torch.where(members, 0.0, FARTHEST))
-    if not found and not still:
-        raise ValueError("rigid_groups: no two patches move together")
     return _competing(seen, found, standing if still else None)
 
 
@@ -183,10 +185,12 @@ def _largest(seen: _Seen, free: Tensor, known: Tensor) -> Tensor | None:
     promise, explained, best, most = torch.zeros_like(known), torch.zeros_like(free), None, 0.0
     for some in patches[spread].split(AT_ONCE) if len(patches) else ():
         promise[some] = _gained(*_misfit(seen, _of_patches(seen, some)), free, known)[0]
+    tried = 0
     for r in promise.argsort(descending=True).tolist():
-        if float(promise[r]) <= most:
+        if float(promise[r]) <= most or tried == REFITTED:
             break
         if not explained[r]:  # by a motion that was refitted, so that its own is the same
+            tried += 1
             gain, members = _refitted(seen, _of_patches(seen, patches.new_tensor([r])), free, known)
             explained |= members
             best, most = (members, gain) if gain > most else (best, most)
@@ -216,9 +220,12 @@ def _refitted(seen: _Seen, motion: _Motion, free: Tensor, known: Tensor) -> tupl
 
 def _competing(seen: _Seen, found: list[Tensor], standing: _Motion | None) -> Groups:
     """All bodies compete for all patches, and each is what it has got, until nothing changes."""
-    usable, last = seen.good.sum(0) >= FEWEST_FRAMES, None
+    usable, last, misfit = seen.good.sum(0) >= FEWEST_FRAMES, None, torch.full_like(seen.place[0], torch.inf)
+    owner = torch.full_like(usable, -1, dtype=torch.long)
     for _ in range(ROUNDS):
         motions = [_of_members(seen, members) for members in found] + ([] if standing is None else [standing])
+        if not motions:
+            break
         each, vague = (torch.cat(part) for part in zip(*(_misfit(seen, motion) for motion in motions), strict=True))
         misfit, owner = each.masked_fill(each + vague >= UNKNOWN, torch.inf).min(0)
         owner = torch.where((misfit < EXPLAINED) & usable, owner, -1)
