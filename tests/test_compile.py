@@ -46,7 +46,7 @@ def test_align_is_one_graph(blindly, monkeypatch):
     monkeypatch.setattr(robust, "FEW_ROUNDS", 1)
     templates, images, start = problem(0)
     reference, options = te.prepare(templates), FEW | {"max_iterations": 1}
-    compiled = torch.compile(te.align, backend="eager", fullgraph=True, dynamic=False)
+    compiled = torch.compile(te.align, backend="aot_eager", fullgraph=True, dynamic=False)
     came = compiled(reference, images, start, **options)
     _, others, begin = problem(3)
     again = compiled(reference, others, begin, **options)
