@@ -157,6 +157,7 @@ def test_wrong_calls():
     for call, message in (
         (lambda: rigid_groups(Estimate(*(v[0] for v in track)), 2), r"track must be \(F, R, ...\)"),
         (lambda: rigid_groups(track, 0), "bodies must be a whole number of at least 1"),
+        (lambda: rigid_groups(track, True), "bodies must be a whole number of at least 1"),
         (lambda: rigid_groups(Track(*(v[:, 38:] for v in track)), 2), "no two patches move together"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -74,7 +74,7 @@ def rigid_groups(track: Estimate, bodies: int) -> Groups:
     """
     if track.pose.dim() != 3:
         raise ValueError(f"rigid_groups: track must be (F, R, ...), got {tuple(track.pose.shape)}")
-    if not isinstance(bodies, int) or bodies < 1:
+    if not isinstance(bodies, int) or isinstance(bodies, bool) or bodies < 1:
         raise ValueError(f"rigid_groups: bodies must be a whole number of at least 1, got {bodies!r}")
     with threads_for(1):  # thousands of operations, none of which is long
         found = _grouped(_sampled(track), bodies)
@@ -186,8 +186,8 @@ def _largest(seen: _Seen, free: Tensor, known: Tensor) -> Tensor | None:
     for some in patches[spread].split(AT_ONCE) if len(patches) else ():
         promise[some] = _gained(*_misfit(seen, _of_patches(seen, some)), free, known)[0]
     tried = 0
-    for r in promise.argsort(descending=True).tolist():
-        if float(promise[r]) <= most or tried == REFITTED:
+    for promised, r in zip(*(v.tolist() for v in promise.sort(descending=True)), strict=True):
+        if promised <= most or tried == REFITTED:
             break
         if not explained[r]:  # by a motion that was refitted, so that its own is the same
             tried += 1
