@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torch_ecc import Status, Tracker
 from torch_ecc.core.reference import MARGIN
-from torch_ecc.sim import PlaneWaves
-from torch_ecc.track.ages import placed
+from torch_ecc.sim import Pads, PlaneWaves
+from torch_ecc.track.ages import averaged_by, placed
 from torch_ecc.track.lessons import AGES, Lessons, shifted
 
 FRAME, SIZE = (110, 120), 61
@@ -244,3 +244,53 @@ def test_what_is_new_does_not_feign_a_shift_once_it_has_been_seen() -> None:
     alone, _ = last([0, 7])
     assert float(error.norm()) < 0.5 * float(alone.norm())
     assert float((error / sigma).abs().max()) < 3
+
+
+def test_two_textures_that_fade_into_each_other_leave_a_plane() -> None:
+    """Few edges, each near one of the new texture: what of a drift is outside of the plane of both textures tells where
+    the last mean lies, better than that edges are seldom alike does."""
+    count, errors, ratios = 12, [], []
+    share = torch.linspace(0, 0.7, count, dtype=torch.float64)
+    there, counted, centre = torch.ones(1, count, dtype=torch.bool), torch.ones(1, 1, 121, 121), torch.zeros(count, 2)
+    for seed in range(4):
+        chance = torch.Generator().manual_seed(seed)
+        off = share[:, None] * torch.tensor((0.1, -0.05, 0.0)).double()
+        off[1:, :2] += 0.01 * torch.randn(count - 1, 2, generator=chance, dtype=torch.float64)
+        poses = off + torch.tensor((60.0, 60.0, 0.0)).double()
+        old, new = (Pads.wafer(seed=100 + 2 * seed + k).render(poses, (121, 121)) for k in (0, 1))
+        images = (1 - share).view(-1, 1, 1, 1) * old + share.view(-1, 1, 1, 1) * new
+        images = (images + 0.64 * torch.randn(images.shape, generator=chance)).float()
+        total = torch.zeros(count, 3, dtype=torch.float64)
+        for _ in range(4):
+            right = shifted(images, "bspline3", total, centre)[None, :, 0]
+            found = placed(right, there, torch.tensor([0.41]), counted, centre[:1])
+            total = total + found.step[0]
+        error = (total + off)[-1, :2]
+        errors.append(error)
+        ratios.append(error / found.covariance[0, -1].diagonal()[:2].sqrt())
+    assert float(torch.stack(errors).square().mean().sqrt()) < 0.012
+    assert float(torch.stack(ratios).square().mean().sqrt()) < 2
+
+
+def test_steps_are_averaged_by_their_covariances() -> None:
+    """What is known only along x says nothing of y; what is not known at all does not count, and where nothing is known
+    the first one stands."""
+    one, two = torch.tensor([[[1.0, 0.0, 0.0], [5.0, 5.0, 5.0]]]), torch.tensor([[[4.0, 2.0, 1.0], [7.0, 7.0, 7.0]]])
+    known = torch.diag(torch.tensor((1.0, 4.0, 1.0)))
+    wide = torch.diag(torch.tensor((2.0, 4.0, 1e12)))
+    nothing = torch.full((3, 3), torch.inf)
+    step, covariance = averaged_by(
+        (one, torch.stack((known, nothing))[None]), (two, torch.stack((wide, nothing))[None])
+    )
+    assert torch.allclose(step[0], torch.tensor([[2.0, 1.0, 0.0], [5.0, 5.0, 5.0]]), atol=1e-5)
+    assert torch.allclose(covariance[0, 0].diagonal(), torch.tensor((2 / 3, 2.0, 1.0)), atol=1e-5)
+    assert torch.equal(covariance[0, 1], nothing)
+
+
+def test_pixels_without_a_number_are_no_exception() -> None:
+    """Steps of images that nobody could place are not finite, and nothing is raised."""
+    images = torch.rand(1, 3, 40, 40, generator=torch.Generator().manual_seed(2))
+    images[0, 1, 5, 5] = torch.nan
+    there, noise = torch.ones(1, 3, dtype=torch.bool), torch.ones(1)
+    found = placed(images, there, noise, torch.ones(1, 1, 40, 40), torch.zeros(1, 2))
+    assert found.step.shape == (1, 3, 3)

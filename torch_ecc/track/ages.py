@@ -10,8 +10,10 @@ are off fulfil
 
 the adjustment of a network in which any two images hold each other by what they have in common beyond the others.
 
-Coarse texture may change at other times than fine: C is that of a cell of few frequencies, and the equations of all
-cells are added. How they disagree tells how exact the steps are.
+Coarse texture may change at other times than fine: C is that of a cell of few frequencies, all of them counting alike,
+and the equations of all cells are added. Or all of it changes evenly: then C is one, of the images as they are, and
+what noise alone fills of it tells most, once there are enough of them. Both steps are taken, each as far as it is exact
+(``averaged_by``), which is told by how cells disagree.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ DARKEST = 1e-4  # of a spectrum's largest value: no frequency counts as if there
 EDGE = 9  # px: over so many what counts is averaged, so that it ends softly
 FAINT = 0.05  # of full weight is what counts at least
 POOR = 0.02  # of the mean power: cells with less tell nothing
+GUESSED = 0.5  # of its values count for a cell, whose C is known from a few of them
 OWN = 1e-5  # of what an image has in a cell no other explains
 
 
@@ -48,23 +51,39 @@ class Places(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Of i by j cells with m values each: what n images show, ``x`` (B, i, j, n, m), their slopes, ``g``
-    (B, i, j, 3 n, m), and how many of the values are independent, ``counts`` (B, i, j), 0 where they tell nothing."""
+    """Of i by j cells of BAND frequencies each way, m values each: what n images show, ``x`` (B, i, j, n, m), and
+    their slopes, ``g`` (B, i, j, 3 n, m), real and imaginary parts in turn."""
 
     x: Tensor
     g: Tensor
-    counts: Tensor
 
     @staticmethod
-    def of(spectra: Tensor, window: Tensor) -> Cells:
-        """Of ``spectra`` (B, 4 n, h', w') of images in a ``window`` (B, 1, h, w); real and imaginary parts."""
+    def of(spectra: Tensor) -> Cells:
+        """Of ``spectra`` (B, 4 n, h', w')."""
         parts = spectra.unflatten(3, (-1, BAND)).unflatten(2, (-1, BAND)).permute(0, 2, 4, 1, 3, 5)
-        values = torch.view_as_real(parts).flatten(4).to(pose_dtype(spectra.device))
-        n = spectra.shape[1] // 4
-        x, g = values.split((n, 3 * n), 3)
-        power = x.square().sum((3, 4))
-        independent = x.shape[4] * window.square().mean((1, 2, 3)).to(power)[:, None, None]
-        return Cells(x, g, independent * (power > POOR * power.mean((1, 2), keepdim=True)))
+        values = torch.view_as_real(parts.contiguous()).flatten(4).to(pose_dtype(spectra.device))
+        return Cells(*values.tensor_split((spectra.shape[1] // 4,), 3))
+
+    def rich(self) -> Cells:
+        """Those alone that tell something."""
+        power = self.x.square().sum((3, 4), keepdim=True)
+        return self._replace(x=self.x * (power > POOR * power.mean((1, 2), keepdim=True)))
+
+
+def hold(x: Tensor, there: Tensor, share: Tensor) -> Tensor:
+    """By how much any two of n images that show ``x`` (B, i, j, n, m) hold each other, -C^-1 (B, i, j, n, n) of those
+    that are ``there`` (B, n), each of its directions times how many values tell it: not more than carry it, and a
+    ``share`` (B,) of these."""
+    C = (x @ x.mT).nan_to_num(0.0, 0.0, 0.0)
+    power = C.diagonal(dim1=3, dim2=4)
+    own = OWN * power + (~there[:, None, None] | (power.sum(3, keepdim=True) == 0))
+    value, vector = torch.linalg.eigh(C + torch.diag_embed(own))
+    carried = (vector.mT @ x).square().unflatten(4, (-1, 2)).sum(5)
+    # Complex values of chance have E |z|^4 = 2 (E |z|^2)^2, and two parts each.
+    count = 4 * carried.sum(4).square() / carried.square().sum(4).clamp(min=LEAST)
+    weight = count * share.to(count)[:, None, None, None] / value
+    held: Tensor = -(vector * weight[..., None, :]) @ vector.mT
+    return held
 
 
 def placed(images: Tensor, there: Tensor, noise: Tensor, counted: Tensor, centre: Tensor) -> Places:
@@ -74,15 +93,29 @@ def placed(images: Tensor, there: Tensor, noise: Tensor, counted: Tensor, centre
 
     A step is right to first order, and too short where images are far off: put right, they are to be placed again.
     """
-    window = inner(counted)
-    shown, slopes = windowed(images, there, window, centre)
+    window, n = inner(counted), images.shape[1]
+    shown = windowed(images, there, window, centre)
+    h, w = (-(-k // (2 * BAND)) * 2 * BAND for k in shown.shape[2:])
+    spectra = torch.fft.rfft2(shown, s=(h, w))[..., :-1]
     power = noise * window.square().sum((1, 2, 3)) * there.sum(1)
-    cells = Cells.of(whitened(shown, slopes, power), window)
-    C = cells.x @ cells.x.mT
-    step, covariance = adjusted(cells, C, there)
-    total = C.sum((1, 2))
+    even, plain = Cells.of(spectra * response(shown[:, :n], power, (h, w))).rich(), Cells.of(spectra)
+    whole, share = plain.x.permute(0, 3, 1, 2, 4).flatten(2)[:, None, None], window.square().mean((1, 2, 3))
+    holds = hold(even.x, there, GUESSED * share), hold(whole, there, share)
+    step, covariance = averaged_by(*(adjusted(*pair, there) for pair in zip((even, plain), holds, strict=True)))
+    total = (even.x @ even.x.mT).sum((1, 2))
     scale = total.diagonal(dim1=1, dim2=2).clamp(min=LEAST).rsqrt()
     return Places(step, covariance, total * scale[:, :, None] * scale[:, None])
+
+
+def averaged_by(*found: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """The mean of steps (B, n, 3) by their covariances (B, n, 3, 3), and its own; the first one where none is known."""
+    steps, covariances = (torch.stack(values) for values in zip(*found, strict=True))
+    weight, known = safe_inverse(covariances.flatten(0, 2))
+    weight, known = weight.view_as(covariances), known.view(steps.shape[:3])[..., None]
+    inverse, regular = safe_inverse(weight.sum(0).flatten(0, 1))
+    inverse, regular = inverse.view_as(covariances[0]), regular.view(steps.shape[1:3])[..., None]
+    mean = (inverse @ (weight @ torch.where(known, steps, 0.0)[..., None]).sum(0))[..., 0]
+    return torch.where(regular, mean, steps[0]), torch.where(regular[..., None], inverse, covariances[0])
 
 
 def inner(counted: Tensor) -> Tensor:
@@ -96,8 +129,8 @@ def averaged(image: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(F.avg_pool2d(image, (side, 1), 1), (1, side), 1)
 
 
-def windowed(images: Tensor, there: Tensor, window: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """What ``images`` (B, n, h, w) show, and their slopes by x, y and theta, (B, 3 n, h, w), off planes and in a
+def windowed(images: Tensor, there: Tensor, window: Tensor, centre: Tensor) -> Tensor:
+    """What ``images`` (B, n, h, w) show, and their slopes by x, y and theta, (B, 4 n, h, w), off planes and in a
     ``window`` (B, 1, h, w); zero for those that are not ``there``."""
     B, n, h, w = images.shape
     y, x = torch.meshgrid(*(torch.arange(k, device=images.device) - (k - 1) / 2 for k in (h, w)), indexing="ij")
@@ -109,30 +142,25 @@ def windowed(images: Tensor, there: Tensor, window: Tensor, centre: Tensor) -> t
     inverse, _ = safe_inverse((planes * weight) @ planes.mT)
     values = (values - (values * weight) @ planes.mT @ inverse @ planes) * weight
     kept = torch.cat((there, there.repeat_interleave(3, 1)), 1)
-    shown, slopes = (values * kept[:, :, None]).unflatten(2, (h, w)).split((n, 3 * n), 1)
-    return shown, slopes
+    return (values * kept[:, :, None]).view(B, 4 * n, h, w)
 
 
-def whitened(shown: Tensor, slopes: Tensor, noise: Tensor) -> Tensor:
-    """The spectra of both (B, 4 n, h', w'), half a plane of whole cells, in which every frequency counts as much as it
-    is texture, not ``noise``, of that power (B,)."""
-    h, w = (-(-k // (2 * BAND)) * 2 * BAND for k in shown.shape[2:])
-    power = torch.fft.fft2(shown, s=(h, w)).abs().square().sum(1, keepdim=True)
+def response(shown: Tensor, noise: Tensor, size: tuple[int, int]) -> Tensor:
+    """By how much a frequency counts (B, 1, h', w'), half a plane of ``size``, if each is to count by how much of it is
+    texture that images (B, n, h, w) have ``shown``, not ``noise``, of that power (B,)."""
+    power = torch.fft.fft2(shown, s=size).abs().square().sum(1, keepdim=True)
     near, shape = (averaged(F.pad(power, (side // 2,) * 4, mode="circular"), side) for side in (SMOOTH, SHAPE))
     floor = (DARKEST * near.amax((2, 3), keepdim=True)).clamp(min=LEAST)
     texture = (1 - noise.to(power)[:, None, None, None] / near.maximum(floor)).clamp(min=0)
-    response = (texture / shape.maximum(floor)).sqrt()
-    spectra: Tensor = torch.fft.rfft2(torch.cat((shown, slopes), 1), s=(h, w)) * response[..., : w // 2 + 1]
-    return spectra[..., : w // 2]
+    half: Tensor = (texture / shape.maximum(floor)).sqrt()[..., : size[1] // 2]
+    return half
 
 
-def adjusted(cells: Cells, C: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
-    """Steps (B, n, 3) and covariances (B, n, 3, 3) of images, those that are ``there`` (B, n) bool, from ``cells`` and
-    their covariances ``C`` (B, i, j, n, n)."""
-    x, g, counts = cells
+def adjusted(cells: Cells, hold: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+    """Steps (B, n, 3) and covariances (B, n, 3, 3) of images, those that are ``there`` (B, n) bool, from ``cells`` in
+    which they ``hold`` (B, i, j, n, n) each other."""
+    x, g = cells
     n = x.shape[3]
-    own = OWN * C.diagonal(dim1=3, dim2=4) + (~there[:, None, None] | (counts == 0)[..., None])
-    hold = -torch.linalg.inv_ex(C + torch.diag_embed(own))[0] * counts[..., None, None]
     cross = (x @ g.mT).unflatten(4, (n, 3))
     cross = (cross - cross.transpose(3, 4)) / 2  # what the window cuts off is the same for both
     pull = -(hold[..., None] * cross).sum(3).flatten(3)  # (B, i, j, 3 n)

@@ -254,12 +254,12 @@ class Teacher:
 
 def steady(found: Places, lag: Tensor) -> Tensor:
     """The steps (n, images, 3) that are ``found``; of one that is far less certain than what renewals usually correct,
-    ``lag`` (n, 3, 3), only what is no chance. Without noise all images are lines through others, and so are places that
-    are wrong: each new one would be farther off than the last."""
-    step, of_step = found.step, found.covariance.diagonal(dim1=2, dim2=3)
+    ``lag`` (n, 3, 3), as much as is likely, s^2 / (s^2 + sigma^2). Without noise all images are lines through others,
+    and so are places that are wrong: each new one would be farther off than the last."""
+    square, of_step = found.step.square(), found.covariance.diagonal(dim1=2, dim2=3)
     usual = lag.diagonal(dim1=1, dim2=2)[:, None]
-    certain = (1 - of_step / step.square().clamp(min=LEAST)).clamp(min=0)
-    return torch.where((of_step > UNSURE**2 * usual) & (usual > 0), certain * step, step)
+    vague = (of_step > UNSURE**2 * usual) & (usual > 0)
+    return torch.where(vague, square / (square + of_step).clamp(min=LEAST) * found.step, found.step)
 
 
 def trust(which: Tensor, step: Tensor, covariance: Tensor, lessons: Lessons) -> None:
