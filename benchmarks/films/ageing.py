@@ -8,16 +8,19 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from films.shot import NOISE, SCENES, sense
+from torch_ecc.core.pose import inverse, transform
 from torch_ecc.paper.bound import jacobian, rounding
 from torch_ecc.sim import PlaneWaves, Scene
 from torch_ecc.sim.camera import sensor
 
 FRAME, CENTER, SIZE = (260, 280), (140.0, 130.0), 121
-CHANGES = ("dissolves", "wave by wave", "patch by patch")
+CHANGES = ("dissolves", "place by place", "wave by wave", "patch by patch")
 LIFE = 400  # frames
 PATCH = 12  # px: side of what is replaced at once
+PLACE, FADES = 24, 0.5  # px from one place to the next, each of which dissolves in that share of the life
 READ = 0.9  # of a frame's time, for all its rows
 
 
@@ -46,8 +49,9 @@ def aged(old: Scene, new: Scene, change: str, share: float, seed: int) -> Callab
         waves = torch.where(gone[:, None], new.waves, old.waves)
         rest = (torch.where(gone, getattr(new, n), getattr(old, n)) for n in ("amplitudes", "phases"))
         return partial(PlaneWaves(waves, *rest).render, size=FRAME)
-    if change == "patch by patch":
-        return partial(_patched, old=old, new=new, share=share, seed=seed)
+    if change in ("patch by patch", "place by place"):
+        own = _patched if change == "patch by patch" else _faded
+        return partial(_by_place, old=old, new=new, share=partial(own, share=share, seed=seed))
     return lambda poses: (1 - share) * old.render(poses, FRAME) + share * new.render(poses, FRAME)
 
 
@@ -67,15 +71,25 @@ def least(family: str, seed: int, frames: int, every: int) -> float:
     return float(covariance.diagonal()[:2].mean().sqrt())
 
 
-def _patched(poses: Tensor, old: Scene, new: Scene, share: float, seed: int) -> Tensor:
-    """Of squares of the surface, each at a time of its own."""
-    back = poses[0]
+def _by_place(poses: Tensor, old: Scene, new: Scene, share: Callable[[Tensor], Tensor]) -> Tensor:
+    """Of every place of the surface, (h, w, 2) px, the new one's ``share`` (h, w)."""
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in FRAME), indexing="ij")
-    c, s = math.cos(float(back[2])), math.sin(float(back[2]))
-    u, v = c * (x - back[0]) - s * (y - back[1]), s * (x - back[0]) + c * (y - back[1])
-    i, j = ((w / PATCH).floor().long() + 50 for w in (u, v))
+    places = transform(inverse(poses), torch.stack((x, y), -1).reshape(-1, 2)).reshape(*FRAME, 2)
+    return torch.lerp(old.render(poses, FRAME).double(), new.render(poses, FRAME).double(), share(places)).float()
+
+
+def _patched(places: Tensor, share: float, seed: int) -> Tensor:
+    """Squares are exchanged at once, each at a time of its own."""
+    i, j = (((places + 1e-6) / PATCH).floor().long() + 50).unbind(-1)
     when = torch.rand(100, 100, generator=torch.Generator().manual_seed(seed))
-    return torch.where(when[j, i] < share, new.render(poses, FRAME)[0, 0], old.render(poses, FRAME)[0, 0])[None, None]
+    return (when[j, i] < share).double()
+
+
+def _faded(places: Tensor, share: float, seed: int) -> Tensor:
+    """Each place begins to dissolve at a time of its own, like those near it."""
+    when = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(seed)).double() * (1 - FADES)
+    begun = functional.grid_sample(when, places[None] / (12 * PLACE), padding_mode="reflection", align_corners=False)
+    return ((share - begun[0, 0]) / FADES).clamp(0, 1)
 
 
 def still(seed: int, frames: int, noise: float = NOISE) -> Iterator[Tensor]:

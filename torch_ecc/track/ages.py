@@ -13,11 +13,12 @@ the adjustment of a network in which any two images hold each other by what they
 Coarse texture may change at other times than fine: C is that of a cell of few frequencies, all of them counting alike,
 and the equations of all cells are added. Or all of it changes evenly: then C is one, of the images as they are, and
 what noise alone fills of it tells most, once there are enough of them. Both steps are taken, each as far as it is exact
-(``averaged_by``), which is told by how cells disagree.
+(``averaged_by``), which is told by how cells, or squares of the images, disagree.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -30,6 +31,7 @@ from torch_ecc.core.pose import pose_dtype
 from torch_ecc.core.sampling import gradients
 
 BAND = 8  # frequencies in x and in y of a cell
+SQUARES = 4  # along an image, of which each has its own part in what all of it tells
 SMOOTH = 7  # frequencies in x and y over which a spectrum is averaged, to tell texture from noise
 SHAPE = 31  # over which what is texture is, to have its shape alone: cells weigh themselves
 DARKEST = 1e-4  # of a spectrum's largest value: no frequency counts as if there were less
@@ -51,23 +53,29 @@ class Places(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Of i by j cells of BAND frequencies each way, m values each: what n images show, ``x`` (B, i, j, n, m), and
-    their slopes, ``g`` (B, i, j, 3 n, m), real and imaginary parts in turn."""
+    """Of i by j squares with m values each: what n images show, ``x`` (B, i, j, n, m), and their slopes, ``g``
+    (B, i, j, 3 n, m); of spectra real and imaginary parts in turn."""
 
     x: Tensor
     g: Tensor
 
     @staticmethod
-    def of(spectra: Tensor) -> Cells:
-        """Of ``spectra`` (B, 4 n, h', w')."""
-        parts = spectra.unflatten(3, (-1, BAND)).unflatten(2, (-1, BAND)).permute(0, 2, 4, 1, 3, 5)
-        values = torch.view_as_real(parts.contiguous()).flatten(4).to(pose_dtype(spectra.device))
-        return Cells(*values.tensor_split((spectra.shape[1] // 4,), 3))
+    def of(values: Tensor, side: int) -> Cells:
+        """Of spectra or images (B, 4 n, h, w), by squares of a ``side``."""
+        padded = F.pad(values, (0, -values.shape[3] % side, 0, -values.shape[2] % side))
+        parts = padded.unflatten(3, (-1, side)).unflatten(2, (-1, side)).permute(0, 2, 4, 1, 3, 5)
+        return Cells(*numbers(parts).flatten(4).tensor_split((values.shape[1] // 4,), 3))
 
     def rich(self) -> Cells:
         """Those alone that tell something."""
         power = self.x.square().sum((3, 4), keepdim=True)
         return self._replace(x=self.x * (power > POOR * power.mean((1, 2), keepdim=True)))
+
+
+def numbers(values: Tensor) -> Tensor:
+    """As real ones, exactly."""
+    real = torch.view_as_real(values.contiguous()) if values.is_complex() else values.contiguous()
+    return real.to(pose_dtype(values.device))
 
 
 def hold(x: Tensor, there: Tensor, share: Tensor) -> Tensor:
@@ -98,10 +106,12 @@ def placed(images: Tensor, there: Tensor, noise: Tensor, counted: Tensor, centre
     h, w = (-(-k // (2 * BAND)) * 2 * BAND for k in shown.shape[2:])
     spectra = torch.fft.rfft2(shown, s=(h, w))[..., :-1]
     power = noise * window.square().sum((1, 2, 3)) * there.sum(1)
-    even, plain = Cells.of(spectra * response(shown[:, :n], power, (h, w))).rich(), Cells.of(spectra)
-    whole, share = plain.x.permute(0, 3, 1, 2, 4).flatten(2)[:, None, None], window.square().mean((1, 2, 3))
-    holds = hold(even.x, there, GUESSED * share), hold(whole, there, share)
-    step, covariance = averaged_by(*(adjusted(*pair, there) for pair in zip((even, plain), holds, strict=True)))
+    even = Cells.of(spectra * response(shown[:, :n], power, (h, w)), BAND).rich()
+    squares = Cells.of(shown, -(-max(shown.shape[2:]) // SQUARES))
+    whole = numbers(spectra[:, :n]).flatten(2)[:, None, None] * math.sqrt(2 / (h * w))  # Parseval, of half a plane
+    share = window.square().mean((1, 2, 3))
+    each = adjusted(even, hold(even.x, there, GUESSED * share), there)
+    step, covariance = averaged_by(each, adjusted(squares, hold(whole, there, share), there))
     total = (even.x @ even.x.mT).sum((1, 2))
     scale = total.diagonal(dim1=1, dim2=2).clamp(min=LEAST).rsqrt()
     return Places(step, covariance, total * scale[:, :, None] * scale[:, None])
@@ -142,7 +152,8 @@ def windowed(images: Tensor, there: Tensor, window: Tensor, centre: Tensor) -> T
     inverse, _ = safe_inverse((planes * weight) @ planes.mT)
     values = (values - (values * weight) @ planes.mT @ inverse @ planes) * weight
     kept = torch.cat((there, there.repeat_interleave(3, 1)), 1)
-    return (values * kept[:, :, None]).view(B, 4 * n, h, w)
+    shown: Tensor = (values * kept[:, :, None]).unflatten(2, (h, w))
+    return shown
 
 
 def response(shown: Tensor, noise: Tensor, size: tuple[int, int]) -> Tensor:
