@@ -115,6 +115,19 @@ def test_what_does_not_change_stays_where_it_is() -> None:
     assert int(tracker.lesson_held) == AGES
 
 
+def test_the_first_frame_stays_among_what_later_ones_are_placed_by() -> None:
+    """As it was, first of all, and as far off as those that were placed by it, if these tell it."""
+    still = [noisy(PlaneWaves.random(seed=3).render(path(1), FRAME), k, 6.0) for k in range(17)]
+    tracker = Tracker(still[0], [START], SIZE, search=False, renew=8)
+    first = tracker.template.clone()
+    tracker.track_sequence(still[1:])
+    assert int(tracker.lesson_held) == 3
+    assert torch.equal(tracker.lesson_older[:, 0], first[:, 0])
+    one, mean = tracker.lesson_places[0, :2, :2]
+    assert float(one.norm()) > 1e-4  # it was off by its noise
+    assert float((mean - one).norm()) < float(one.norm())
+
+
 @pytest.mark.parametrize("level", [0.0, 240.0])
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_cover_is_not_learned(level: float, moving: bool) -> None:

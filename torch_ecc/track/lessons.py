@@ -1,9 +1,9 @@
 """Templates that last: the first one as the mean of some frames, and made anew, slowly, of surfaces that change.
 
 A template that follows its surface must not drift off it. Every new one is the mean of frames placed by the last one,
-and is then put where the means before it have it, some of all ages, the first one among them for as long as it is like
-the last one at all (``track.ages``): nothing adds up but what the surface itself has lost. Means are kept as they were
-seen, with how far they are off: rounding of 1e-7 px each time that they are put right would add up, too.
+and is then put where the means before it have it, some of all ages, the first frame among them for as long as it is
+like the last one at all (``track.ages``): nothing adds up but what the surface itself has lost. Means are kept as they
+were seen, with how far they are off: rounding of 1e-7 px each time that they are put right would add up, too.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class Lessons(NamedTuple):
     sum, and ``times`` (R, 1, h, w) each, how many frames; how many ``learned`` (R,) from in this round, and how many
     ``rounds`` (R,) there have been; the template's ``noise`` (R,) at first, and of how many ``frames`` (R,) it is the
     mean now; of the first round the sums of poses from the start (R, 3, 3): of p, p times the number of the frame, and
-    p^2, the ``moves``, and what they leave of one frame's scatter in where the template lies, the ``share`` (R,); means
-    of all ages, the ``older`` (R, AGES, h, w), off by ``places`` (R, AGES, 3), of which so many are ``held`` (R,), the
-    oldest first; covariances (R, 3, 3), in the template's axes, of the place of that one, ``oldest``, the template's
-    own, ``place``, and what renewals have corrected, ``lag``; and by how much (R, 3) what is new in a round is expected
-    to drag poses along, the ``lead`` that the template is given over that.
+    p^2, the ``moves``, and what they leave of one frame's scatter in where the template lies, the ``share`` (R,); the
+    first frame and means of all ages, the ``older`` (R, AGES, h, w), off by ``places`` (R, AGES, 3), of which so many
+    are ``held`` (R,), the oldest first; covariances (R, 3, 3), in the template's axes, of the place of that one,
+    ``oldest``, the template's own, ``place``, and what renewals have corrected, ``lag``; and by how much (R, 3) what is
+    new in a round is expected to drag poses along, the ``lead`` that the template is given over that.
     """
 
     fresh: Tensor
@@ -82,7 +82,7 @@ class Lessons(NamedTuple):
         counts = one.long(), torch.zeros_like(one).long()
         moves, *trusted = (place.clone() for _ in range(4))
         more = noise.clone(), one.clone(), moves, one.clone()
-        ages = template.repeat(1, AGES, 1, 1), pose.new_zeros(len(pose), AGES, 3), torch.zeros_like(one).long()
+        ages = template.repeat(1, AGES, 1, 1), pose.new_zeros(len(pose), AGES, 3), one.long()
         values = *images, *counts, *more, *ages, *trusted, torch.zeros_like(pose)
         return dict(zip(LESSONS, values, strict=True))
 
@@ -229,6 +229,7 @@ class Teacher:
         new, off = torch.where(enough, mean, old), torch.where(first[:, None], offset, 0.0)
         if self.rounds[1] > 0:
             seen = Crop(new, crop.mask[which] * enough, crop.centre[which])
+            lessons.places[which, 0] += off  # the first frame, as far as what was placed by it
             off = self.among_older(which, seen, off, lessons) + lessons.lead[which]
         crop.template[which] = torch.where(enough, shifted(new, self.interpolation, off, crop.centre[which]), old)
         lessons.frames[which] = lessons.learned[which].to(lessons.frames)
@@ -266,8 +267,6 @@ def trust(which: Tensor, step: Tensor, covariance: Tensor, lessons: Lessons) -> 
     """What is known of the places of the templates at ``which`` (n,), which have been put right by a ``step`` (n, 3)
     with a ``covariance`` (n, 3, 3) as against the oldest mean."""
     rounds, square = lessons.rounds[which][:, None, None], step[:, :, None] * step[:, None]
-    # What was new in the first round has dragged its mean along, too, by half as much as in the second one.
-    lessons.oldest[which] += torch.where(rounds == 1, square / 4, 0.0)
     place = lessons.oldest[which] + covariance
     lessons.place[which] = torch.where(place.isfinite(), place, lessons.place[which])
     share = torch.where(rounds > 0, 1 / rounds.clamp(min=1, max=SOME), 0.0).to(step)
