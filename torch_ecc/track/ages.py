@@ -85,7 +85,8 @@ def hold(x: Tensor, there: Tensor, share: Tensor) -> Tensor:
     C = (x @ x.mT).nan_to_num(0.0, 0.0, 0.0)
     power = C.diagonal(dim1=3, dim2=4)
     own = OWN * power + (~there[:, None, None] | (power.sum(3, keepdim=True) == 0))
-    value, vector = torch.linalg.eigh(C + torch.diag_embed(own))
+    # On the host: not every device has it, and the matrices are small.
+    value, vector = (part.to(C) for part in torch.linalg.eigh((C + torch.diag_embed(own)).cpu()))
     carried = (vector.mT @ x).square().unflatten(4, (-1, 2)).sum(5)
     # Complex values of chance have E |z|^4 = 2 (E |z|^2)^2, and two parts each.
     count = 4 * carried.sum(4).square() / carried.square().sum(4).clamp(min=LEAST)
