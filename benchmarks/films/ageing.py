@@ -17,10 +17,11 @@ from torch_ecc.sim import PlaneWaves, Scene
 from torch_ecc.sim.camera import sensor
 
 FRAME, CENTER, SIZE = (260, 280), (140.0, 130.0), 121
-CHANGES = ("dissolves", "place by place", "wave by wave", "patch by patch")
+FADES = {"place by place": 0.5, "place by place, fast": 0.25}  # of the life, in which each place dissolves
+CHANGES = ("dissolves", *FADES, "wave by wave", "patch by patch")
 LIFE = 400  # frames
 PATCH = 12  # px: side of what is replaced at once
-PLACE, FADES = 24, 0.5  # px from one place to the next, each of which dissolves in that share of the life
+PLACE = 24  # px from one place to the next
 READ = 0.9  # of a frame's time, for all its rows
 
 
@@ -49,8 +50,8 @@ def aged(old: Scene, new: Scene, change: str, share: float, seed: int) -> Callab
         waves = torch.where(gone[:, None], new.waves, old.waves)
         rest = (torch.where(gone, getattr(new, n), getattr(old, n)) for n in ("amplitudes", "phases"))
         return partial(PlaneWaves(waves, *rest).render, size=FRAME)
-    if change in ("patch by patch", "place by place"):
-        own = _patched if change == "patch by patch" else _faded
+    if change in ("patch by patch", *FADES):
+        own = _patched if change == "patch by patch" else partial(_faded, fades=FADES[change])
         return partial(_by_place, old=old, new=new, share=partial(own, share=share, seed=seed))
     return lambda poses: (1 - share) * old.render(poses, FRAME) + share * new.render(poses, FRAME)
 
@@ -85,11 +86,11 @@ def _patched(places: Tensor, share: float, seed: int) -> Tensor:
     return (when[j, i] < share).double()
 
 
-def _faded(places: Tensor, share: float, seed: int) -> Tensor:
+def _faded(places: Tensor, share: float, seed: int, fades: float) -> Tensor:
     """Each place begins to dissolve at a time of its own, like those near it."""
-    when = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(seed)).double() * (1 - FADES)
+    when = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(seed)).double() * (1 - fades)
     begun = functional.grid_sample(when, places[None] / (12 * PLACE), padding_mode="reflection", align_corners=False)
-    return ((share - begun[0, 0]) / FADES).clamp(0, 1)
+    return ((share - begun[0, 0]) / fades).clamp(0, 1)
 
 
 def still(seed: int, frames: int, noise: float = NOISE) -> Iterator[Tensor]:
