@@ -168,15 +168,15 @@ def response(shown: Tensor, noise: Tensor, size: tuple[int, int]) -> Tensor:
     return half
 
 
-def adjusted(cells: Cells, hold: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+def adjusted(cells: Cells, held: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
     """Steps (B, n, 3) and covariances (B, n, 3, 3) of images, those that are ``there`` (B, n) bool, from ``cells`` in
-    which they ``hold`` (B, i, j, n, n) each other."""
+    which any two are ``held`` (B, i, j, n, n) together (``hold``)."""
     x, g = cells
     n = x.shape[3]
     cross = (x @ g.mT).unflatten(4, (n, 3))
     cross = (cross - cross.transpose(3, 4)) / 2  # what the window cuts off is the same for both
-    pull = -(hold[..., None] * cross).sum(3).flatten(3)  # (B, i, j, 3 n)
-    edges = (g @ g.mT) * hold.repeat_interleave(3, 3).repeat_interleave(3, 4)
+    pull = -(held[..., None] * cross).sum(3).flatten(3)  # (B, i, j, 3 n)
+    edges = (g @ g.mT) * held.repeat_interleave(3, 3).repeat_interleave(3, 4)
     edges = (edges + edges.mT) / 2
     free = (there & there[:, :1] & (torch.arange(n, device=x.device) > 0)).repeat_interleave(3, 1)
     both, one = free[:, :, None] & free[:, None], torch.eye(3 * n, dtype=x.dtype, device=x.device)
