@@ -15,7 +15,8 @@ from torch import Tensor
 from torch_ecc import Status, Tracker, align, prepare
 from torch_ecc.core.align import engine_for
 from torch_ecc.core.covariance import hidden
-from torch_ecc.core.robust import quantile, solve, trust, weighted_median
+from torch_ecc.core.robust import solve, trust
+from torch_ecc.core.scale import quantile, weighted_median
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Trust
 from torch_ecc.sim.scene.micrograph import micrograph

@@ -15,10 +15,18 @@ import torch
 from torch import Tensor
 
 from torch_ecc.core.blocks import Blocks
-from torch_ecc.core.grid import BLOCK
 from torch_ecc.core.normal import LEAST
-from torch_ecc.core.reference import Reference, each
+from torch_ecc.core.reference import Fields, Reference, each
 from torch_ecc.core.sampling import SAMPLERS, is_cpu
+from torch_ecc.core.scale import (
+    LEAST_SLIP,
+    Scale,
+    excess,
+    median_fit,
+    residual_variance,
+    robust_scale,
+    weighted_median,
+)
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.solution import Engine, Solution, Trust
 from torch_ecc.core.verdict import LEAST_COVERAGE, Number, correlation, detrended, expected_score, within_margin
@@ -27,12 +35,9 @@ ROUNDED_OFF = 0.15  # of the contrast, by bilinear interpolation
 OUTLIER = 3.0  # times the variance that is expected of a block: beyond it less and less is believed
 DISTRUST = 3.0  # trust = (OUTLIER / ratio)^this
 NO_TRUST = 0.02  # less is none
-QUANTILE, TO_MEDIAN = 0.3, 1.13  # of the blocks' variances: a scale that covers of well over half cannot raise
-LEAST_SLIP, SLIP = 0.00125, 0.045  # px^2 / 2: blocks may seem to have slipped by 0.05 px rms, as of the sampler,
-FIRST_SLIP = 1.0  # to 0.3 px; before the solve by more
+SLIP, FIRST_SLIP = 0.045, 1.0  # px^2 / 2: blocks may seem to have slipped by 0.3 px rms; before the solve by more
 LARGEST_SLIP = 0.5  # where all do, as of blur, nothing need cover any of them
 LEAST_NOISE = 0.01  # of the template's contrast: smaller residuals shift nothing
-SEEN = 0.5  # of a block's weight must be in sight for it to tell the scale
 ROUNDS, FEW_ROUNDS = 8, 3  # until trust settles; where the host does not look
 CLEARLY_LESS = 0.9  # of the cost of least squares, where that has not found the template
 LEAST_WORSE = 0.2  # of what blocks gain, others lose: a cover fits as badly as before, but blurred edges fit worse
@@ -45,13 +50,6 @@ FAMILIAR = 0.8  # of the usual score: what has less where it was tracked to may 
 THERE = 0.5  # gain of most blocks: what is covered has about the gain that it always has, what has jumped has none
 FARTHEST = 8.0  # px, of the farthest pixel: what is seen in part has not moved more
 SETTLED = 0.01  # of the template's weight: trust changes no more
-
-
-class Scale(NamedTuple):
-    """The variance expected per pixel of a block: ``noise`` + ``slip`` * (mean square of its slopes), (B, 1) each."""
-
-    noise: Tensor
-    slip: Tensor
 
 
 class Memory(NamedTuple):
@@ -113,6 +111,30 @@ class Doubted(NamedTuple):
         return self.engine(self.reference, self.image, start, settings, Trust(self.which, trusted, self.asked))
 
 
+class Plain(NamedTuple):
+    """What least squares has ``found`` of n templates: their ``score`` (n,), and by how many times the variance of
+    their blocks is more than that of most lets expect, the ``ratio`` (n, blocks)."""
+
+    found: Solution
+    score: Tensor
+    ratio: Tensor
+
+    @staticmethod
+    def of(doubted: Doubted, found: Solution) -> Plain:
+        """Of those that are doubted."""
+        _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], any_scale(doubted))
+        return Plain(found, correlation(found.normal, found.total), ratio)
+
+    @property
+    def uneven(self) -> Tensor:
+        """Which (n,) have blocks that fit far worse than others."""
+        return ~(self.ratio <= OUTLIER).all(1)
+
+    def at(self, some: Tensor) -> Plain:
+        """Some of them (n,) bool."""
+        return part_of(self, some)
+
+
 def solve(
     engine: Engine,
     reference: Reference,
@@ -129,28 +151,28 @@ def solve(
     odd = unusual(reference, found, settings, memory.score)
     if odd is None:
         return found
-    doubted, plain = Doubted.of(engine, reference, image, settings, memory), found._replace(trust=whole(found))
+    doubted, least = Doubted.of(engine, reference, image, settings, memory), found._replace(trust=whole(found))
     if on_cpu:  # nowhere else does the host ask which ones
-        doubted, plain = doubted.at(odd), part_of(plain, odd)
-    uneven = has_outliers(doubted, plain)
-    doubtful = uneven | ~within_margin(correlation(plain.normal, plain.total), doubted.usual)
+        doubted, least = doubted.at(odd), part_of(least, odd)
+    plain = Plain.of(doubted, least)
+    doubtful = plain.uneven | ~within_margin(plain.score, doubted.usual)
     if memory.put_off:
         return found._replace(odd=odd, doubtful=doubtful)
     if on_cpu:
         if not doubtful.any():
             return found._replace(odd=odd)
-        doubted, plain, uneven = doubted.at(doubtful), part_of(plain, doubtful), uneven[doubtful]
+        doubted, plain = doubted.at(doubtful), plain.at(doubtful)
         if memory.put_off_gone and (left := gone(doubted, start, plain)).any():
             named = torch.zeros_like(odd).index_put((doubted.which,), left)
             found = found._replace(odd=odd, doubtful=named)
             if left.all():
                 return found
-            doubted, plain, uneven = doubted.at(~left), part_of(plain, ~left), uneven[~left]
-        doubtful = torch.ones_like(uneven)
-    again, taken = solved_again(doubted if on_cpu else doubted._replace(asked=doubtful), start, plain, uneven)
+            doubted, plain = doubted.at(~left), plain.at(~left)
+        doubtful = torch.ones_like(plain.uneven)
+    again, taken = solved_again(doubted if on_cpu else doubted._replace(asked=doubtful), start, plain)
     answer = found
     if not on_cpu or taken.any():
-        new = chosen(doubtful & taken, again, plain)
+        new = chosen(doubtful & taken, again, plain.found)
         before = found._replace(trust=whole(found), odd=None, doubtful=None)
         answer = each(lambda old, new: old.index_copy(0, doubted.which, new), before, new)
     return answer._replace(odd=odd, doubtful=found.doubtful)
@@ -173,33 +195,28 @@ def unusual(reference: Reference, found: Solution, settings: Settings, usual: Te
     return None if on_cpu and not odd.any() else odd
 
 
-def gone(doubted: Doubted, start: Tensor, plain: Solution) -> Tensor:
+def gone(doubted: Doubted, start: Tensor, plain: Plain) -> Tensor:
     """Which templates (n,), seen whole in the last frame, least squares does not find, and most of whose blocks do not
     see them at the ``start`` (B, 3), whatever may cover the others: they have jumped."""
-    left = (correlation(plain.normal, plain.total) < FAMILIAR * doubted.usual) & (doubted.last == 1).all(1)
+    left = (plain.score < FAMILIAR * doubted.usual) & (doubted.last == 1).all(1)
     if not left.any():
         return left
     look = doubted.solve(start, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
     return left & (median_fit(look.sums, doubted.blocks)[1][:, 0] < THERE)
 
 
-def has_outliers(doubted: Doubted, found: Solution) -> Tensor:
-    """Which templates (n,) have blocks that fit far worse than others."""
-    _, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], any_scale(doubted))
-    return ~(ratio <= OUTLIER).all(1)
-
-
-def solved_again(doubted: Doubted, start: Tensor, plain: Solution, uneven: Tensor) -> tuple[Solution, Tensor]:
-    """The best answer that trust leads to, and where (n,) it is to be taken for the ``plain`` one, whose blocks are
-    ``uneven`` (n,).
+def solved_again(doubted: Doubted, start: Tensor, plain: Plain) -> tuple[Solution, Tensor]:
+    """The best answer that trust leads to, and where (n,) it is to be taken for the ``plain`` one.
 
     Noise may have grown in all of the patch, or light be another: then least squares is right, and leaving out most of
     it is not.
     """
-    score, least = correlation(plain.normal, plain.total), RECOGNISED * doubted.usual
-    best, fits, other = best_trial(doubted, start, plain, score >= least)
-    recognised = torch.maximum(score, detrended(plain.normal, plain.total)) >= least
-    return best, other & (uneven | fits) & (covers_most(best) | ~recognised)
+    least, found = RECOGNISED * doubted.usual, plain.found
+    best, fits, other = best_trial(doubted, start, plain, plain.score >= least)
+    if is_cpu(other.device) and not other.any():
+        return best, other
+    recognised = torch.maximum(plain.score, detrended(found.normal, found.total)) >= least
+    return best, other & (plain.uneven | fits) & (covers_most(best) | ~recognised)
 
 
 def covers_most(found: Solution) -> Tensor:
@@ -207,40 +224,42 @@ def covers_most(found: Solution) -> Tensor:
     return found.normal.total >= LEAST_COVERAGE * found.sums[:, 0].sum(1)
 
 
-def best_trial(doubted: Doubted, start: Tensor, plain: Solution, recognised: Tensor) -> tuple[Solution, Tensor, Tensor]:
+def best_trial(doubted: Doubted, start: Tensor, plain: Plain, recognised: Tensor) -> tuple[Solution, Tensor, Tensor]:
     """The best, whether it fits (n,), and whether it is another (n,), of the ``plain`` answer and those that trust
     leads to if it begins with the residuals of least squares, or with those under a median fit, at the ``start`` (B, 3)
     or where least squares has come to, and has not slid away. Where least squares has ``recognised`` (n,) the template
     and the first trial is no better, no other is made; where it has not, one that recognises most of the template fits.
     """
-    strange, other = ~recognised, torch.zeros_like(recognised)
-    there = start.index_copy(0, doubted.which, plain.pose)
+    strange, other, best, on_cpu = ~recognised, torch.zeros_like(recognised), plain.found, is_cpu(start.device)
+    there = start.index_copy(0, doubted.which, best.pose)
     here, lever = start[doubted.which], doubted.reference.place.lever[doubted.which]
-    variance, seen = residual_variance(plain.sums), plain.sums[:, 0]
-    usual = usual_scale(doubted, plain.gain, SLIP)
-    first = usual, trust(compared(doubted, variance, seen, any_scale(doubted))[1])
+    seen, usual = best.sums[:, 0], usual_scale(doubted, best.gain, SLIP)
     share = seen / seen.sum(1, keepdim=True).clamp(min=LEAST)
-    best, (left, fits) = plain, cost(doubted, plain, plain.gain)
+    left, fits = cost(doubted, best, best.gain)
     least = CLEARLY_LESS * (left * share).sum(1)
-    brightest = BRIGHTER * plain.gain.abs()  # a few blocks fit with any gain
+    brightest = BRIGHTER * best.gain.abs()  # a few blocks fit with any gain
+    first = usual, trust(plain.ratio)
     trials: list[tuple[Tensor, tuple[Scale, Tensor] | None]] = [(there, first), (start, None), (there, None)]
-    remembered = is_cpu(start.device) and bool((doubted.last < 1).any())
+    remembered = on_cpu and bool((doubted.last < 1).any())
     if remembered:
         trials.insert(0, (start, (usual, doubted.last)))
-    for place, begin in trials if is_cpu(start.device) else trials[:1]:  # elsewhere all templates would go through all
+    for place, begin in trials if on_cpu else trials[:1]:  # elsewhere all templates would go through all
         found = reweighted(doubted, place, *(begin or median_look(doubted, place)))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
-        well |= strange & recognises_most(doubted, found)
+        if not on_cpu or strange.any():
+            well |= strange & recognises_most(doubted, found)
         total = (price * share).sum(1)
         better = torch.where(well == fits, total < least, well)  # what fits most of it, or else what leaves less
         better = torch.where(recognised, (well >= fits) & improves(left, price, share), better)
         better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
-        best, recognised, other = chosen(better, found, best), recognised & ~better, other | better
+        recognised, other = recognised & ~better, other | better
+        if not on_cpu or better.any():
+            best = chosen(better, found, best)
+            left, fits = torch.where(better[:, None], price, left), torch.where(better, well, fits)
+            least = torch.where(better, total, least)
         if remembered:  # a cover mostly stays: what has led here in the last frame, and does so again, is enough
             recognised, remembered = recognised | better & covers_most(found), False
-        left, fits = torch.where(better[:, None], price, left), torch.where(better, well, fits)
-        least = torch.where(better, total, least)
-        if is_cpu(start.device) and bool((fits | recognised).all()):
+        if on_cpu and bool((fits | recognised).all()):
             break
     return best, fits, other
 
@@ -321,7 +340,7 @@ def chosen(better: Tensor, new: Solution, old: Solution) -> Solution:
     return each(lambda a, b: torch.where(better.view(-1, *[1] * (a.dim() - 1)), a, b), new, old)
 
 
-def part_of(found: Solution, some: Tensor) -> Solution:
+def part_of(found: Fields, some: Tensor) -> Fields:
     """That of ``some`` templates (B,) bool."""
     return found if some.all() else each(lambda value: value[some], found)
 
@@ -337,61 +356,9 @@ def trust(ratio: Tensor) -> Tensor:
     return torch.where(weight < NO_TRUST, 0.0, weight)
 
 
-def excess(variance: Tensor, blocks: Blocks, seen: Tensor, scale: Scale) -> Tensor:
-    """Residual ``variance`` (B, n) of blocks over what is expected; of those with less weight ``seen`` (B, n) than that
-    of a block's pixels by as much less over 1 as noise scatters more in them."""
-    ratio = variance / torch.addcmul(scale.noise, scale.slip, blocks.slope)
-    return (ratio - 1).mul_((seen / BLOCK**2).clamp_(max=1).sqrt_()).add_(1)
-
-
 def least_noise(reference: Reference, settings: Settings) -> Tensor:
     """Variance (B, 1) that noise has at least: that of the template's, or next to nothing of its contrast; of a sampler
     without prefilter, what it rounds off itself."""
     share = LEAST_NOISE if SAMPLERS[settings.interpolation].ring else ROUNDED_OFF
     least = torch.maximum(reference.noise.of_frame, share**2 * reference.normal.contrast)
     return least.to(reference.K.dtype).unsqueeze(1)
-
-
-def residual_variance(sums: Tensor) -> Tensor:
-    """Mean square (B, n) of each block's residuals from the sums (B, 10, n)."""
-    return sums[:, 6] / sums[:, 0].clamp(min=LEAST)
-
-
-def robust_scale(variance: Tensor, blocks: Blocks, seen: Tensor, floor: Tensor, most: Scale) -> Scale:
-    """The scale of block variances (B, n): noise from the flatter half of the blocks, slip from the others.
-
-    ``seen`` (B, n): weight in sight; ``floor`` (B, 1): the least noise; ``most``: the largest scale.
-    """
-    there = seen > SEEN * blocks.weight
-    noise = quantile(variance, blocks.flat & there).minimum(most.noise).maximum(floor)
-    slip = quantile((variance - noise) / blocks.slope.clamp(min=LEAST), blocks.steep & there)
-    return Scale(noise, slip.clamp(min=LEAST_SLIP).minimum(most.slip))
-
-
-def quantile(values: Tensor, used: Tensor) -> Tensor:
-    """What a share of QUANTILE of the values (B, n) that are ``used`` does not exceed, brought to their median as of
-    noise: (B, 1)."""
-    ranked = torch.where(used, values, torch.inf).sort(1).values
-    rank = (used.sum(1, keepdim=True) * QUANTILE).long()
-    return (ranked.gather(1, rank) * TO_MEDIAN).nan_to_num(0.0, 0.0, 0.0)
-
-
-def median_fit(sums: Tensor, blocks: Blocks) -> tuple[Tensor, Tensor]:
-    """Each block's mean square (B, n) of what gain * t + offset leaves of it, and the gain (B, 1): the median of those
-    of single blocks, weighted by their contrast, as is the offset. A minority of blocks does not move them."""
-    weight, g, gg, tg = sums[:, :4].unbind(1)
-    seen, some = weight / blocks.weight.clamp(min=LEAST), weight.clamp(min=LEAST)
-    t, tt = blocks.t * seen, blocks.square * seen
-    contrast = (tt - t * t / some).clamp(min=0)
-    gain = weighted_median((tg - t * g / some) / contrast.clamp(min=LEAST), contrast * blocks.steep)
-    offset = weighted_median((g - gain * t) / some, weight)
-    left = gg - 2 * (gain * tg + offset * g) + gain * gain * tt + 2 * gain * offset * t + offset * offset * weight
-    return left.clamp(min=0) / some, gain
-
-
-def weighted_median(values: Tensor, weight: Tensor) -> Tensor:
-    """(B, n), (B, n) -> (B, 1)."""
-    ranked, order = values.sort(1)
-    share = weight.gather(1, order).cumsum(1)
-    middle = (share < share[:, -1:] / 2).sum(1, keepdim=True)
-    return ranked.gather(1, middle.clamp(max=values.shape[1] - 1))

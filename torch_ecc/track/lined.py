@@ -42,7 +42,10 @@ def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapp
     known of them, ``lines`` (R, 2, 2) in the ``state`` of a tracker, is their variance along x and y, and how far off
     it is to be asked for, again and again."""
     lines, moved = state["lines"], estimate.displacement.detach()[:, :2]
-    (power, due), on_cpu, reach = lines.unbind(2), is_cpu(moved.device), moved.abs()
+    on_cpu = is_cpu(moved.device)
+    if on_cpu and nothing_due(lines.tolist(), moved.tolist()):
+        return estimate
+    (power, due), reach = lines.unbind(2), moved.abs()
     farther = reach > due
     if not on_cpu or bool(farther.any()):
         reach = reach.clamp(max=FARTHEST)
@@ -53,13 +56,18 @@ def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapp
         again = FARTHER * reach + NEAREST
         again = torch.where(again < FARTHEST, again, NEVER)
         lines.copy_(torch.stack((power, torch.where(farther, again, due)), 2))
-    if on_cpu and not bool(power.any()):
+    along = torch.bmm(turn(estimate.pose.detach().select(1, 2)).mT[:, :2, :2], moved.unsqueeze(2)).squeeze(2)
+    near = torch.where(along.abs() <= FAR, along * (-along.square() / REACH).exp(), 0.0) * power
+    if on_cpu and not bool(near.any()):
         return estimate
-    along = (turn(estimate.pose.detach()[:, 2]).mT[:, :2, :2] @ moved[:, :, None])[:, :, 0]
-    near = torch.where(along.abs() <= FAR, along * (-along.square() / REACH).exp(), 0.0)
-    pull = OF_LINES / reference.noise.response[:, :1] * lines[:, :, 0] * near
-    off = reference.normal.inverse[:, :3, :3] @ (reference.normal.bread_bias[:, :, :2] * pull[:, None])
-    return uncertain(estimate, off)
+    normal, pull = reference.normal, OF_LINES / reference.noise.response[:, :1] * near
+    return uncertain(estimate, torch.bmm(normal.inverse[:, :3, :3], normal.bread_bias[:, :, :2] * pull.unsqueeze(1)))
+
+
+def nothing_due(lines: list[list[list[float]]], moved: list[list[float]]) -> bool:
+    """Whether the host sees at once that no lines are known, and there is nothing to ask for."""
+    axes = (pair for each in zip(lines, moved, strict=True) for pair in zip(*each, strict=True))
+    return all(power == 0 and abs(d) <= due for (power, due), d in axes)
 
 
 def unknown_lines(start: Tensor) -> Tensor:

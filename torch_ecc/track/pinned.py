@@ -69,8 +69,8 @@ def pinned(estimate: Estimate, reference: Reference, state: Mapping[str, Tensor]
 
 def uncertain(estimate: Estimate, off: Tensor) -> Estimate:
     """The ``estimate`` (R, ...) whose poses may be off, in the template's axes, by each of k columns (R, 3, k) too."""
-    there = turn(estimate.pose.detach()[:, 2]) @ off
-    return estimate._replace(covariance=estimate.covariance + (there @ there.mT).nan_to_num(0.0, 0.0, 0.0))
+    there = torch.bmm(turn(estimate.pose.detach().select(1, 2)), off)
+    return estimate._replace(covariance=estimate.covariance + torch.bmm(there, there.mT).nan_to_num_(0.0, 0.0, 0.0))
 
 
 def nothing_missing(share: list[float], rms: list[float], power: list[float], frames: list[float]) -> bool:
