@@ -3,6 +3,7 @@
 ``python benchmarks/command.py [--frames N] [--rounds N] [--only mjpeg h264 tiff16] [--out FILE.json]``: 640 x 480, one
 patch and 64 (in an eighth of the frames), with and without the overlay, on a quiet machine and with one core kept busy.
 Of the whole process, and per frame: what a tenth of the frames takes, start-up and pictures at the end, is taken off.
+Without the tracking, too (``command_rest.py``): less than that no tracker could take.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from torch_ecc.sim.scene.waves import PlaneWaves
 
 SIZE, SIDE = 121, 41  # px, of one patch and of many
 MANY = [(80.0 + 68.0 * i, 72.0 + 48.0 * j) for i in range(8) for j in range(8)]
-PLAIN = Path(__file__).parent / "plain_opencv.py"
+PLAIN, REST = (Path(__file__).parent / name for name in ("plain_opencv.py", "command_rest.py"))
 
 
 class Cost(NamedTuple):
@@ -107,15 +108,15 @@ def kept_busy(wanted: bool) -> Iterator[None]:
 
 
 def commands(path: Path, centers: list[tuple[float, float]], size: int, out: str) -> dict[str, list[str]]:
-    """The script, the command, and the command with its overlay."""
+    """The script, and the command without and with its overlay, tracking or not."""
     places = [f"{number:g}" for center in centers for number in center]
     options = [word for x, y in centers for word in ("--center", f"{x:g}", f"{y:g}")] + ["--size", str(size)]
-    ours = [sys.executable, "-m", "torch_ecc", "track", str(path), *options, "--out"]
-    return {
-        "script": [sys.executable, str(PLAIN), str(path), f"{out}/plain.csv", str(size), *places],
-        "track": [*ours, f"{out}/a", "--no-overlay"],
-        "overlay": [*ours, f"{out}/b"],
-    }
+    ours = ["track", str(path), *options, "--out"]
+    found = {"script": [sys.executable, str(PLAIN), str(path), f"{out}/plain.csv", str(size), *places]}
+    for rest, start in (("", ["-m", "torch_ecc"]), (" but tracking", [str(REST)])):
+        found[f"track{rest}"] = [sys.executable, *start, *ours, f"{out}/a{rest}", "--no-overlay"]
+        found[f"overlay{rest}"] = [sys.executable, *start, *ours, f"{out}/b{rest}"]
+    return found
 
 
 def race(paths: list[Path], centers: list[tuple[float, float]], size: int, rounds: int) -> dict[str, list[Cost]]:
@@ -132,12 +133,12 @@ def race(paths: list[Path], centers: list[tuple[float, float]], size: int, round
 def figures(case: str, costs: dict[str, list[Cost]]) -> Iterator[Number]:
     """What a race over a short and a long sequence has shown, printed too."""
     script = costs["script"]
-    for name in ("track", "overlay"):
+    for name in [name for name in costs if name != "script"]:
         for kind in Cost._fields:
             (a, b), (p, q) = ([getattr(cost, kind) for cost in each] for each in (costs[name], script))
             whole, frame = b / q, (b - a) / (q - p)
             print(
-                f"{case:29} {name:8} {kind:10} {b:6.2f} s of {q:6.2f}: {whole:5.2f}   per frame {frame:5.2f}",
+                f"{case:29} {name:20} {kind:10} {b:6.2f} s of {q:6.2f}: {whole:5.2f}   per frame {frame:5.2f}",
                 flush=True,
             )
             yield Number(f"{case}, {name}: {kind} time over the script's", whole, "", "lower", 0.2)

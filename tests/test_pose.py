@@ -34,6 +34,7 @@ def test_group_laws(a, b, c):
     assert torch.allclose(P.retract(a, b), P.compose(a, P.inverse(b)), atol=1e-9)
     points = torch.tensor([[3.0, -4.0], [0.5, 9.0]], dtype=torch.float64)
     assert torch.allclose(P.transform(P.compose(a, b), points), P.transform(a, P.transform(b, points)), atol=1e-9)
+    assert torch.allclose(torch.tensor(P.warp(*a.tolist()), dtype=torch.float64), P.matrix(a)[:2], atol=1e-9)
 
 
 @given(shapes, st.integers(0, 2**31))

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_ecc.core.pose import matrix
+from torch_ecc.core.pose import warp
 from torch_ecc.io.canvas import WHITE, Box, Canvas, Stretch
 from torch_ecc.io.film import Film, FilmWriter, Picture
 from torch_ecc.io.frames import Frame
@@ -97,12 +97,12 @@ class OverlayWriter(FilmWriter):
         moved: Sequence[NDArray[np.float64] | None] = [None] * len(status)
         if self._um is not None:
             moved = list(arrays["displacement"][:, :2] @ self._um.T)
-        warps = matrix(torch.from_numpy(arrays["pose"]))[:, :2].numpy()
+        warps = np.array([warp(*pose) for pose in arrays["pose"].tolist()])
         scores, lines = arrays["score"].tolist(), self._outlines
         values = zip(arrays["pose"], warps, scores, status, lines, self._trails, moved, strict=True)
         marks = []
-        for number, (pose, warp, score, word, outline, trail, um) in enumerate(values):
-            mark = Mark(number, pose, warp, score, word, outline, trail, um)
+        for number, (pose, place, score, word, outline, trail, um) in enumerate(values):
+            mark = Mark(number, pose, place, score, word, outline, trail, um)
             if not mark.lost:
                 trail.append((float(pose[0]), float(pose[1])))
             marks.append(mark)
