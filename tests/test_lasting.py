@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -12,8 +13,8 @@ from torch import Tensor
 
 from torch_ecc import Status, Tracker
 from torch_ecc.core.reference import MARGIN
-from torch_ecc.sim import Pads, PlaneWaves
-from torch_ecc.track.ages import averaged_by, placed
+from torch_ecc.sim import Pads, PlaneWaves, Scene
+from torch_ecc.track.ages import UNEVEN, averaged_by, placed
 from torch_ecc.track.lessons import AGES, Lessons, shifted
 
 FRAME, SIZE = (110, 120), 61
@@ -230,7 +231,7 @@ def test_who_learns_nothing_holds_nothing() -> None:
     """A tracker that is not told to learn has no such state."""
     names = dict(Tracker(film(1, 2.0)[0], [START], SIZE).named_buffers())
     assert not any(name.startswith("lesson") for name in names)
-    assert len(Lessons._fields) == 15
+    assert len(Lessons._fields) == 16
 
 
 def test_what_is_new_does_not_feign_a_shift_once_it_has_been_seen() -> None:
@@ -248,7 +249,7 @@ def test_what_is_new_does_not_feign_a_shift_once_it_has_been_seen() -> None:
         some, total = images[which], off.new_zeros(len(which), 3)
         for _ in range(5):
             there = torch.ones(1, len(which), dtype=torch.bool)
-            found = placed(some[None], there, torch.tensor([0.25]), counted, centre)
+            found = placed(some[None], there, torch.tensor([0.25]), counted, centre, torch.zeros(1))
             some = shifted(some[:, None], "bspline3", found.step[0], total[:, :2] * 0)[:, 0]
             total = total + found.step[0]
         return (total[-1] - off[-1])[:2], found.covariance[0, -1].diagonal()[:2].sqrt()
@@ -276,13 +277,43 @@ def test_two_textures_that_fade_into_each_other_leave_a_plane() -> None:
         total = torch.zeros(count, 3, dtype=torch.float64)
         for _ in range(4):
             right = shifted(images, "bspline3", total, centre)[None, :, 0]
-            found = placed(right, there, torch.tensor([0.41]), counted, centre[:1])
+            found = placed(right, there, torch.tensor([0.41]), counted, centre[:1], torch.zeros(1))
             total = total + found.step[0]
         error = (total + off)[-1, :2]
         errors.append(error)
         ratios.append(error / found.covariance[0, -1].diagonal()[:2].sqrt())
     assert float(torch.stack(errors).square().mean().sqrt()) < 0.012
     assert float(torch.stack(ratios).square().mean().sqrt()) < 2
+
+
+@pytest.mark.parametrize("scene", [PlaneWaves.random, Pads.wafer])
+def test_where_places_change_one_after_the_other_sigma_says_so(scene: Callable[..., Scene]) -> None:
+    """What changes evenly, as one cell of frequencies or another would have it, is no drift; where it does not, that is
+    seen, and never forgotten: then all of it is asked at once, and says how little it knows."""
+    count, ratios, chances = 10, [], []
+    time, drift = torch.linspace(0, 0.6, count, dtype=torch.float64), torch.tensor((0.6, -0.3, 0.0)).double()
+    there, counted, centre = torch.ones(1, count, dtype=torch.bool), torch.ones(1, 1, 121, 121), torch.zeros(count, 2)
+    for seed in range(4):
+        chance = torch.Generator().manual_seed(seed)
+        begun = 0.75 * torch.rand(1, 1, 6, 6, generator=chance, dtype=torch.float64)
+        begun = torch.nn.functional.interpolate(begun, (121, 121), mode="bilinear", align_corners=True)
+        off = time[:, None] * drift
+        poses = off + torch.tensor((60.0, 60.0, 0.0)).double()
+        old, new = (scene(seed=100 + 2 * seed + k).render(poses, (121, 121)).double() for k in (0, 1))
+        noise = 0.64 * torch.randn(old.shape, generator=chance)
+        even = (torch.lerp(old[:1], new[:1], time.view(-1, 1, 1, 1)) + noise).float()
+        images = (torch.lerp(old, new, ((time.view(-1, 1, 1, 1) - begun) / 0.25).clamp(0, 1)) + noise).float()
+        total, uneven = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(1)
+        chances.append(float(placed(even[None, :, 0], there, torch.tensor([0.41]), counted, centre[:1], uneven).uneven))
+        for _ in range(3):
+            right = shifted(images, "bspline3", total, centre)[None, :, 0]
+            found = placed(right, there, torch.tensor([0.41]), counted, centre[:1], uneven)
+            total, uneven = total + found.step[0], torch.maximum(uneven, found.uneven)
+            assert bool((found.uneven == uneven).all())
+        assert float(uneven) > UNEVEN
+        ratios.append((total + off)[-1, :2] / found.covariance[0, -1].diagonal()[:2].sqrt())
+    assert sorted(chances)[-2] < 0.6 * UNEVEN  # of few pads one scene in eight looks uneven
+    assert float(torch.stack(ratios).square().mean().sqrt()) < 2  # 3.9 and 5.9 if it were taken for even
 
 
 def test_steps_are_averaged_by_their_covariances() -> None:
@@ -305,5 +336,5 @@ def test_pixels_without_a_number_are_no_exception() -> None:
     images = torch.rand(1, 3, 40, 40, generator=torch.Generator().manual_seed(2))
     images[0, 1, 5, 5] = torch.nan
     there, noise = torch.ones(1, 3, dtype=torch.bool), torch.ones(1)
-    found = placed(images, there, noise, torch.ones(1, 1, 40, 40), torch.zeros(1, 2))
+    found = placed(images, there, noise, torch.ones(1, 1, 40, 40), torch.zeros(1, 2), torch.zeros(1))
     assert found.step.shape == (1, 3, 3)

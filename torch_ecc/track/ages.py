@@ -14,6 +14,9 @@ Coarse texture may change at other times than fine: C is that of a cell of few f
 and the equations of all cells are added. Or all of it changes evenly: then C is one, of the images as they are, and
 what noise alone fills of it tells most, once there are enough of them. Both steps are taken, each as far as it is exact
 (``averaged_by``), which is told by how cells, or squares of the images, disagree.
+
+Cells take it for even over the whole image. Where one place changes after the other they take a drift for that, and all
+alike: where squares have ever changed more unlike each other than chance lets them, cells are not asked any more.
 """
 
 from __future__ import annotations
@@ -40,16 +43,19 @@ FAINT = 0.05  # of full weight is what counts at least
 POOR = 0.02  # of the mean power: cells with less tell nothing
 GUESSED = 0.5  # of its values count for a cell, whose C is known from a few of them
 OWN = 1e-5  # of what an image has in a cell no other explains
+UNEVEN = 6.0  # times as unevenly as what there is is what changes spread over squares: not by chance
+UNASKED = 1e12  # times its covariance a step has that is none
 
 
 class Places(NamedTuple):
     """Of n images: the ``step`` (B, n, 3) by which each is off, px, px, rad in the template's axes, and its
     ``covariance`` (B, n, 3, 3), both zero for the first one, which is right, and without it; by how much any two are
-    ``alike`` (B, n, n), a correlation."""
+    ``alike`` (B, n, n), a correlation; how ``uneven`` (B,) at most what has changed of them has been, see there."""
 
     step: Tensor
     covariance: Tensor
     alike: Tensor
+    uneven: Tensor
 
 
 class Cells(NamedTuple):
@@ -95,10 +101,10 @@ def hold(x: Tensor, there: Tensor, share: Tensor) -> Tensor:
     return held
 
 
-def placed(images: Tensor, there: Tensor, noise: Tensor, counted: Tensor, centre: Tensor) -> Places:
+def placed(images: Tensor, there: Tensor, noise: Tensor, counted: Tensor, centre: Tensor, before: Tensor) -> Places:
     """``images`` (B, n, h, w), from the oldest to the newest, of which some are ``there`` (B, n) bool, with white
     ``noise`` of that variance (B,); ``counted`` (B, 1, h, w): by how much pixels count; ``centre`` (B, 2): what they
-    turn about, from their middle.
+    turn about, from their middle; ``before`` (B,): how uneven changes have been.
 
     A step is right to first order, and too short where images are far off: put right, they are to be placed again.
     """
@@ -108,14 +114,41 @@ def placed(images: Tensor, there: Tensor, noise: Tensor, counted: Tensor, centre
     spectra = torch.fft.rfft2(shown, s=(h, w))[..., :-1]
     power = noise * window.square().sum((1, 2, 3)) * there.sum(1)
     even = Cells.of(spectra * response(shown[:, :n], power, (h, w)), BAND).rich()
-    squares = Cells.of(shown, -(-max(shown.shape[2:]) // SQUARES))
+    side = -(-max(shown.shape[2:]) // SQUARES)
+    squares, seen = (Cells.of(values, side) for values in (shown, window.expand(-1, 4, -1, -1)))
     whole = numbers(spectra[:, :n]).flatten(2)[:, None, None] * math.sqrt(2 / (h * w))  # Parseval, of half a plane
     share = window.square().mean((1, 2, 3))
-    each = adjusted(even, hold(even.x, there, GUESSED * share), there)
-    step, covariance = averaged_by(each, adjusted(squares, hold(whole, there, share), there))
+    uneven = torch.maximum(before, unevenness(squares.x, seen.x, there))
+    asked = torch.where(uneven > UNEVEN, UNASKED, 1.0)[:, None, None, None]
+    steps, covariances = adjusted(even, hold(even.x, there, GUESSED * share), there)
+    step, covariance = averaged_by((steps, covariances * asked), adjusted(squares, hold(whole, there, share), there))
     total = (even.x @ even.x.mT).sum((1, 2))
     scale = total.diagonal(dim1=1, dim2=2).clamp(min=LEAST).rsqrt()
-    return Places(step, covariance, total * scale[:, :, None] * scale[:, None])
+    return Places(step, covariance, total * scale[:, :, None] * scale[:, None], uneven)
+
+
+def unevenness(x: Tensor, window: Tensor, there: Tensor) -> Tensor:
+    """How many times as unevenly (B,) as what n images show is spread over squares, ``x`` (B, i, j, n, m), what one has
+    not kept of another is, at most; seen in a ``window`` (B, i, j, 1, m). Of those that are ``there`` (B, n)."""
+    gram = x @ x.mT
+    power = gram.diagonal(dim1=3, dim2=4)
+    all_of_it = power.sum((1, 2))[:, None, None].clamp(min=LEAST)
+    kept = gram.sum((1, 2), keepdim=True) / all_of_it[..., None]
+    changed = (power[..., None, :] - 2 * kept * gram + kept.square() * power[..., None]).clamp(min=0)
+    seen = window.square().sum(4)
+    of_all, of_changed = (variation(value, seen) for value in (power, changed.flatten(3)))
+    usual = (of_all * there).sum(1, keepdim=True) / there.sum(1, keepdim=True).clamp(min=1)
+    pairs = (there[:, :, None] & there[:, None]).triu(1).flatten(1)
+    return (of_changed * pairs / usual.clamp(min=LEAST)).amax(1)
+
+
+def variation(power: Tensor, seen: Tensor) -> Tensor:
+    """The variance (B, n) over squares of the ``power`` (B, i, j, n) per pixel that is ``seen`` (B, i, j, 1), over the
+    square of its mean."""
+    share = seen / seen.sum((1, 2), keepdim=True).clamp(min=LEAST)
+    each = power / seen.clamp(min=LEAST)
+    mean = (each * share).sum((1, 2), keepdim=True).clamp(min=LEAST)
+    return ((each / mean - 1).square() * share).sum((1, 2))
 
 
 def averaged_by(*found: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

@@ -54,7 +54,8 @@ class Lessons(NamedTuple):
     first frame and means of all ages, the ``older`` (R, AGES, h, w), off by ``places`` (R, AGES, 3), of which so many
     are ``held`` (R,), the oldest first; covariances (R, 3, 3), in the template's axes, of the place of that one,
     ``oldest``, the template's own, ``place``, and what renewals have corrected, ``lag``; and by how much (R, 3) what is
-    new in a round is expected to drag poses along, the ``lead`` that the template is given over that.
+    new in a round is expected to drag poses along, the ``lead`` that the template is given over that; how ``uneven``
+    (R,) changes have been at most, see ``ages``.
     """
 
     fresh: Tensor
@@ -72,6 +73,7 @@ class Lessons(NamedTuple):
     place: Tensor
     lag: Tensor
     lead: Tensor
+    uneven: Tensor
 
     @staticmethod
     def begin(template: Tensor, noise: Tensor, pose: Tensor) -> dict[str, Tensor]:
@@ -83,7 +85,7 @@ class Lessons(NamedTuple):
         moves, *trusted = (place.clone() for _ in range(4))
         more = noise.clone(), one.clone(), moves, one.clone()
         ages = template.repeat(1, AGES, 1, 1), pose.new_zeros(len(pose), AGES, 3), one.long()
-        values = *images, *counts, *more, *ages, *trusted, torch.zeros_like(pose)
+        values = *images, *counts, *more, *ages, *trusted, torch.zeros_like(pose), torch.zeros_like(pose[:, 0])
         return dict(zip(LESSONS, values, strict=True))
 
 
@@ -96,18 +98,19 @@ def lessons_in(state: State) -> Lessons | None:
 
 
 def with_new_parts(state: dict[str, Any], prefix: str) -> None:
-    """What was saved with fewer means of older ages, or before these had places of their own, or a tracker shares of
-    noise and lines that stay and doubts of a look, is filled, in place."""
+    """What was saved with fewer means of older ages, or before these had places of their own or changes were uneven, or
+    a tracker shares of noise and lines that stay and doubts of a look, is filled, in place."""
     start = state.get(f"{prefix}start")
     if isinstance(start, Tensor) and start.dim() == 2:
         state.setdefault(f"{prefix}fixed", torch.zeros_like(start[:, 0]))
         state.setdefault(f"{prefix}doubt", start.new_zeros(len(start), 3, 3))
         state.setdefault(f"{prefix}lines", unknown_lines(start))
-    images, places = (f"{prefix}lesson_{name}" for name in ("older", "places"))
+    images, places, uneven = (f"{prefix}lesson_{name}" for name in ("older", "places", "uneven"))
     older = state.get(images)
     if isinstance(older, Tensor) and older.dim() == 4 and 0 < older.shape[1] <= AGES:
         right = older.new_zeros(len(older), older.shape[1], 3, dtype=pose_dtype(older.device))
         known, missing = state.get(places, right), AGES - older.shape[1]
+        state.setdefault(uneven, right[:, 0, 0].clone())
         state[images] = torch.cat((older, older[:, -1:].expand(-1, missing, -1, -1)), 1)
         if isinstance(known, Tensor) and known.shape == right.shape:
             state[places] = torch.nn.functional.pad(known, (0, 0, 0, missing))
@@ -246,7 +249,8 @@ class Teacher:
         about = seen.centre.repeat_interleave(AGES + 1, 0)
         for _ in range(PASSES):
             right = shifted(images.flatten(0, 1)[:, None], self.interpolation, places.flatten(0, 1), about)
-            found = placed(right.view_as(images), there, noise, seen.mask, seen.centre)
+            found = placed(right.view_as(images), there, noise, seen.mask, seen.centre, lessons.uneven[which])
+            lessons.uneven[which] = found.uneven
             places = places + steady(found, lessons.lag[which]).nan_to_num(0.0, 0.0, 0.0)
         trust(which, places[:, -1] - off, found.covariance[:, -1], lessons)
         remember(which, images, places, there, found, lessons)
