@@ -137,8 +137,9 @@ def unevenness(x: Tensor, window: Tensor, there: Tensor) -> Tensor:
     changed = (power[..., None, :] - 2 * kept * gram + kept.square() * power[..., None]).clamp(min=0)
     seen = window.square().sum(4)
     of_all, of_changed = (variation(value, seen) for value in (power, changed.flatten(3)))
-    usual = (of_all * there).sum(1, keepdim=True) / there.sum(1, keepdim=True).clamp(min=1)
-    pairs = (there[:, :, None] & there[:, None]).triu(1).flatten(1)
+    some = there.to(x)
+    usual = (of_all * some).sum(1, keepdim=True) / some.sum(1, keepdim=True).clamp(min=1)
+    pairs = (some[:, :, None] * some[:, None]).triu(1).flatten(1)
     return (of_changed * pairs / usual.clamp(min=LEAST)).amax(1)
 
 
