@@ -8,6 +8,7 @@ where the engine comes to with that trust, until it settles.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import inf, log
 from typing import NamedTuple
 
@@ -108,7 +109,16 @@ class Doubted(NamedTuple):
 
     def solve(self, start: Tensor, settings: Settings, trusted: Tensor) -> Solution:
         """From ``start`` (B, 3) on, with blocks (n, blocks) as they are trusted."""
-        return self.engine(self.reference, self.image, start, settings, Trust(self.which, trusted, self.asked))
+        return self._solve(start, settings, Trust(self.which, trusted, self.asked))
+
+    def look(self, start: Tensor, settings: Settings, trusted: Tensor) -> Solution:
+        """The same without the normal equations, if the engine can leave them to those that need them."""
+        judged = not is_cpu(start.device) or self.reference.sight is not None
+        return self._solve(start, settings, Trust(self.which, trusted, self.asked, judged))
+
+    def _solve(self, start: Tensor, settings: Settings, trust: Trust) -> Solution:
+        found = self.engine(self.reference, self.image, start, settings, trust)
+        return found._replace(trust=trust.blocks)
 
 
 class Plain(NamedTuple):
@@ -201,7 +211,7 @@ def gone(doubted: Doubted, start: Tensor, plain: Plain) -> Tensor:
     left = (plain.score < FAMILIAR * doubted.usual) & (doubted.last == 1).all(1)
     if not left.any():
         return left
-    look = doubted.solve(start, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
+    look = doubted.look(start, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
     return left & (median_fit(look.sums, doubted.blocks)[1][:, 0] < THERE)
 
 
@@ -244,9 +254,10 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Plain, recognised: Tensor
     if remembered:
         trials.insert(0, (start, (usual, doubted.last)))
     for place, begin in trials if on_cpu else trials[:1]:  # elsewhere all templates would go through all
-        found = reweighted(doubted, place, *(begin or median_look(doubted, place)))
+        found, judged = reweighted(doubted, place, *(begin or median_look(doubted, place)))
         price, well = cost(doubted, found, found.gain.minimum(brightest))
         if not on_cpu or strange.any():
+            found = judged(found)
             well |= strange & recognises_most(doubted, found)
         total = (price * share).sum(1)
         better = torch.where(well == fits, total < least, well)  # what fits most of it, or else what leaves less
@@ -254,11 +265,13 @@ def best_trial(doubted: Doubted, start: Tensor, plain: Plain, recognised: Tensor
         better &= torch.linalg.vector_norm((found.pose - here) * lever, dim=1) < FARTHEST
         recognised, other = recognised & ~better, other | better
         if not on_cpu or better.any():
+            found = judged(found)
             best = chosen(better, found, best)
             left, fits = torch.where(better[:, None], price, left), torch.where(better, well, fits)
             least = torch.where(better, total, least)
-        if remembered:  # a cover mostly stays: what has led here in the last frame, and does so again, is enough
-            recognised, remembered = recognised | better & covers_most(found), False
+            if remembered:  # a cover mostly stays: what has led here in the last frame, and does so again, is enough
+                recognised |= better & covers_most(found)
+        remembered = False
         if on_cpu and bool((fits | recognised).all()):
             break
     return best, fits, other
@@ -288,19 +301,22 @@ def improves(old: Tensor, new: Tensor, share: Tensor) -> Tensor:
 
 def median_look(doubted: Doubted, place: Tensor) -> tuple[Scale, Tensor]:
     """Scale and trust (n, blocks) under a median fit at ``place`` (B, 3)."""
-    look = doubted.solve(place, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
+    look = doubted.look(place, doubted.settings.once, torch.ones_like(doubted.blocks.weight))
     variance, gain = median_fit(look.sums, doubted.blocks)
     scale, ratio = compared(doubted, variance, look.sums[:, 0], usual_scale(doubted, gain[:, 0], FIRST_SLIP))
     return scale, trust(ratio)
 
 
-def reweighted(doubted: Doubted, place: Tensor, scale: Scale, after: Tensor) -> Solution:
+def reweighted(
+    doubted: Doubted, place: Tensor, scale: Scale, after: Tensor
+) -> tuple[Solution, Callable[[Solution], Solution]]:
     """Solved from their ``place`` (B, 3) on, with trust that begins as ``after`` (n, blocks) a look of that ``scale``
-    and settles."""
+    and settles; and what brings the normal equations to that if it has none: as long as all of the solve, and few ask
+    for them."""
     blocks = doubted.blocks
     for _ in range(ROUNDS if is_cpu(place.device) else FEW_ROUNDS):
-        before = after
-        found = doubted.solve(place, doubted.settings, before)
+        begun, before = place, after
+        found = doubted.look(place, doubted.settings, before)
         most = Scale(scale.noise, scale.slip.clamp(max=SLIP))  # no cover may talk itself in
         scale, ratio = compared(doubted, residual_variance(found.sums), found.sums[:, 0], most)
         after = trust(ratio)
@@ -308,7 +324,12 @@ def reweighted(doubted: Doubted, place: Tensor, scale: Scale, after: Tensor) -> 
         if is_cpu(place.device) and bool((change <= SETTLED * blocks.weight.sum(1)).all()):
             break
         place = place.index_copy(0, doubted.which, found.pose)
-    return found._replace(trust=before)
+
+    def judged(found: Solution) -> Solution:
+        known = found.normal is not doubted.reference.normal
+        return found if known else doubted.solve(begun, doubted.settings, before)
+
+    return found, judged
 
 
 def any_scale(doubted: Doubted) -> Scale:
