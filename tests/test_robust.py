@@ -15,6 +15,7 @@ from torch import Tensor
 from torch_ecc import Status, Tracker, align, prepare
 from torch_ecc.core.align import engine_for
 from torch_ecc.core.covariance import hidden
+from torch_ecc.core.native import engine
 from torch_ecc.core.robust import solve, trust
 from torch_ecc.core.scale import quantile, weighted_median
 from torch_ecc.core.settings import Settings
@@ -246,3 +247,24 @@ def test_where_all_that_tells_the_pose_is_covered_the_flat_rest_is_not_enough():
     stack = noisy(torch.stack((ground + mark, ground, ground)), 1.0)
     track = Tracker(stack[0], [MIDDLE], SIZE, search=False).track_sequence(stack[1:])
     assert (track.status == Status.LOST).all()
+
+
+@compiled
+def test_a_trial_that_is_no_better_costs_no_normal_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One block with more noise than the others is looked at again without it; where that changes nothing, least
+    squares stands as it is, and so do its normal equations."""
+    frames, poses = shots("waves")
+    before, now = (frames[k] + 2 * torch.randn(FRAME, generator=torch.Generator().manual_seed(k)) for k in (0, 1))
+    now[96:104, 96:104] += 7 * torch.randn(8, 8, generator=torch.Generator().manual_seed(7))
+    reference = prepare(
+        before[None, None, 39:160, 44:165], centre=poses[:1, :2].float() - torch.tensor([[104.0, 99.0]])
+    )
+    made, counted = [], engine.normal_equations
+    monkeypatch.setattr(engine, "normal_equations", lambda *of: made.append(of) or counted(*of))
+    image, start = now[None, None].contiguous(), poses[1:2]
+    plain = solve(engine.solve, reference, image, start, Settings(robust=False))
+    found = solve(engine.solve, reference, image, start, Settings())
+    assert found.odd is not None
+    assert found.trust is None or bool((found.trust == 1).all())
+    assert torch.equal(found.pose, plain.pose)
+    assert not made
