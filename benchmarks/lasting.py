@@ -67,10 +67,10 @@ def joined(runs: Iterable[Run]) -> Run:
     return Run(*map(torch.cat, zip(*runs, strict=True)))
 
 
-def follow(film: Iterator[tuple[Tensor, Tensor]], **options) -> Run:
+def follow(film: Iterator[tuple[Tensor, Tensor]], size: int = SIZE, **options) -> Run:
     """A tracker over a film, whose first frame is the template's."""
     first, _ = next(film)
-    tracker, rows = Tracker(first, [CENTER], SIZE, search=False, **options), []
+    tracker, rows = Tracker(first, [CENTER], size, search=False, **options), []
     for frame, truth in film:
         begun = time.perf_counter()
         estimate = tracker(frame)
@@ -80,18 +80,18 @@ def follow(film: Iterator[tuple[Tensor, Tensor]], **options) -> Run:
     return Run(*(torch.stack(values) for values in zip(*rows, strict=True)))
 
 
-def surfaces(frames: int, seeds: int, families: Iterable[str]) -> Iterator[Number]:
+def surfaces(frames: int, seeds: int, families: Iterable[str], size: int) -> Iterator[Number]:
     for family in families:
         for change in ageing.CHANGES:
             if change == "wave by wave" and family != "waves":
                 continue
             if change == "dissolves":
                 for after in AFTER:
-                    bound = ageing.least(family, 0, after, RENEW)
+                    bound = ageing.least(family, 0, after, RENEW, size)
                     yield Number(f"{family} {change}, least known to anyone / after {after}", bound, "px")
             films = [list(ageing.changing(family, change, seed, frames)) for seed in range(seeds)]
             for title, options in (("as it was", {}), (f"renew {RENEW}", {"renew": RENEW})):
-                runs = [follow(iter(film), **options) for film in films]
+                runs = [follow(iter(film), size, **options) for film in films]
                 yield from joined(runs).figures(f"{family} {change}, {title}")
 
 
@@ -163,16 +163,17 @@ def show(numbers: list[Number]) -> None:
 @click.command()
 @click.option("--scenes", default=2, show_default=True, help="of each family")
 @click.option("--only", multiple=True, type=click.Choice(["shutter", "dim", "surface", "still"]), help="one part")
+@click.option("--size", default=SIZE, show_default=True, help="px of the patches of surfaces")
 @click.option("--quick", is_flag=True, help="waves only, and some frames")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="the figures as JSON")
-def main(scenes: int, only: tuple[str, ...], quick: bool, out: Path | None) -> None:
+def main(scenes: int, only: tuple[str, ...], size: int, quick: bool, out: Path | None) -> None:
     """Measure all of it."""
     torch.set_num_threads(1)
     families = ("waves",) if quick else ("waves", "pads", "speckle")
     parts = {
         "shutter": partial(shutters, 10 if quick else 60),
         "dim": partial(dim, 2 if quick else 40),
-        "surface": partial(surfaces, 12 if quick else ageing.LIFE, 1 if quick else scenes, families),
+        "surface": partial(surfaces, 12 if quick else ageing.LIFE, 1 if quick else scenes, families, size),
         "still": partial(drifts, 60 if quick else 10_000),
     }
     numbers = [number for name in only or parts for number in parts[name]()]

@@ -338,3 +338,12 @@ def test_pixels_without_a_number_are_no_exception() -> None:
     there, noise = torch.ones(1, 3, dtype=torch.bool), torch.ones(1)
     found = placed(images, there, noise, torch.ones(1, 1, 40, 40), torch.zeros(1, 2), torch.zeros(1))
     assert found.step.shape == (1, 3, 3)
+    assert bool(found.uneven.isfinite().all())  # which is kept: one bad mean must not spoil all others
+
+
+def test_nothing_that_has_changed_is_not_uneven() -> None:
+    """Of images that are the same, as of a simulator without noise, rounding is left, in no place as in another."""
+    image = PlaneWaves.random(seed=3).render(path(1), FRAME)[:, :, 10:98, 16:104].float()
+    there, noise = torch.ones(1, 5, dtype=torch.bool), torch.full((1,), 1e-6)
+    same = image.expand(1, 5, -1, -1)
+    assert float(placed(same, there, noise, torch.ones(1, 1, 88, 88), torch.zeros(1, 2), torch.zeros(1)).uneven) < 2

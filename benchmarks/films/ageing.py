@@ -56,7 +56,7 @@ def aged(old: Scene, new: Scene, change: str, share: float, seed: int) -> Callab
     return lambda poses: (1 - share) * old.render(poses, FRAME) + share * new.render(poses, FRAME)
 
 
-def least(family: str, seed: int, frames: int, every: int) -> float:
+def least(family: str, seed: int, frames: int, every: int, size: int = SIZE) -> float:
     """Standard deviation in x and y, px, below which nobody knows from images alone where a surface that ``dissolves``
     lies after some ``frames`` as against the first image, each the mean of ``every`` so many: Cramer-Rao bound, with
     both textures unknown. In a plane of images (1 - a) A + a B a drift in a shows by its square alone."""
@@ -64,7 +64,7 @@ def least(family: str, seed: int, frames: int, every: int) -> float:
     mixed = torch.stack((1 - share, share), 1)
     inside = mixed @ torch.linalg.solve(mixed.mT @ mixed, mixed.mT)
     weight = (torch.eye(len(share), dtype=torch.float64) - inside) * every / (NOISE**2 + rounding(8))
-    old, new = (jacobian(SCENES[family](100 + 2 * seed + k), (SIZE, SIZE))[1] for k in (0, 1))
+    old, new = (jacobian(SCENES[family](100 + 2 * seed + k), (size, size))[1] for k in (0, 1))
     slopes = mixed[:, :1, None] * old + mixed[:, 1:, None] * new  # (n, N, 3)
     normal = torch.einsum("ipa,jpb,ij->iajb", slopes, slopes, weight)[1:, :, 1:]
     sides = 3 * (len(share) - 1)

@@ -135,12 +135,13 @@ def unevenness(x: Tensor, window: Tensor, there: Tensor) -> Tensor:
     all_of_it = power.sum((1, 2))[:, None, None].clamp(min=LEAST)
     kept = gram.sum((1, 2), keepdim=True) / all_of_it[..., None]
     changed = (power[..., None, :] - 2 * kept * gram + kept.square() * power[..., None]).clamp(min=0)
+    changed = changed + OWN * power[..., None, :]  # where nothing has changed it is as even as what there is
     seen = window.square().sum(4)
     of_all, of_changed = (variation(value, seen) for value in (power, changed.flatten(3)))
     some = there.to(x)
     usual = (of_all * some).sum(1, keepdim=True) / some.sum(1, keepdim=True).clamp(min=1)
     pairs = (some[:, :, None] * some[:, None]).triu(1).flatten(1)
-    return (of_changed * pairs / usual.clamp(min=LEAST)).amax(1)
+    return (of_changed * pairs / usual.clamp(min=LEAST)).nan_to_num(0.0, 0.0, 0.0).amax(1)
 
 
 def variation(power: Tensor, seen: Tensor) -> Tensor:
