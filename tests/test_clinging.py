@@ -85,7 +85,7 @@ def test_patterns_are_what_strains_leave(criterion):
     reference, image, start = Problem((40, 43), mask="one", centred=False, dtype=torch.float32).made(criterion)
     found = solve(reference, image, start, Settings())
     strains = strains_shown(reference, found)
-    pattern, shift = strains.pattern.unflatten(2, (3, -1)), strains.shift
+    pattern, shift = strains.pattern.float().unflatten(2, (3, -1)), strains.shift.float()
     (gx, gy), grid = reference.signal[0, :2], reference.grid
     x, y = (grid.pixels[:2] - reference.place.centre[0, :, None]) / float(reference.place.radius)
     for k, (moved, _) in enumerate(STRAINS):
@@ -97,7 +97,7 @@ def test_patterns_are_what_strains_leave(criterion):
         scale = float(direct.abs().max())
         torch.testing.assert_close(pattern[0, k], direct, rtol=0, atol=2e-3 * scale)
         torch.testing.assert_close(shift[0, :, k], u[:3], rtol=2e-3, atol=1e-5)
-        effect = 0.3 * direct[None]
+        effect = 0.3 * direct[None].double()
         strain, _, certain = strained_by(strains, effect)
         assert certain > 0.99
         assert without_strain(strains, effect, strain).abs().max() < 0.01 * scale

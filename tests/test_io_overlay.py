@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torch_ecc.core.pose import transform
 from torch_ecc.io import OverlayWriter, open_frames
-from torch_ecc.io.beside import ahead
+from torch_ecc.io.beside import ahead, batches
 from torch_ecc.io.marks import Mark
 from torch_ecc.io.shapes import outlines
 from torch_ecc.io.sinks import open_sink
@@ -267,6 +267,12 @@ def test_reading_ahead_keeps_order_and_errors():
         for item in ahead(items()):
             seen.append(item)  # noqa: PERF402
     assert seen == list(range(100))
+    seen = []
+    with pytest.raises(ValueError, match="the end"):  # noqa: PT012
+        for some in batches(items(), 8):
+            seen.append(some)  # noqa: PERF402
+    assert [len(some) for some in seen] == [*[8] * 12, 4]
+    assert sum(seen, []) == list(range(100))
     stream = ahead(iter(range(10**9)))
     assert next(stream) == 0
     stream.close()

@@ -18,9 +18,11 @@ from torch_ecc.commands.bodies import drawn_with
 from torch_ecc.commands.live import Latency
 from torch_ecc.core.estimate import Estimate, Reason, Status
 from torch_ecc.io import Frame, OverlayWriter, TrackWriter
+from torch_ecc.io.beside import batches
 from torch_ecc.io.journal import Unfinished
 from torch_ecc.io.stabilised import StabilisedWriter
 from torch_ecc.track.lessons import LESSONS
+from torch_ecc.track.lookahead import MOST
 from torch_ecc.track.tracker import Tracker
 
 Pictures: TypeAlias = OverlayWriter | StabilisedWriter
@@ -60,15 +62,22 @@ class Run:
         self._open.__exit__(*error)
 
     def through(
-        self, frames: Iterable[Frame], progress: Callable[[int], None], *told: Callable[[Frame, Estimate], None]
+        self,
+        frames: Iterable[Frame],
+        progress: Callable[[int], None],
+        *told: Callable[[Frame, Estimate], None],
+        at_once: int = MOST,
     ) -> None:
-        """All of them; ``progress`` is told how many frames are done, before that each of ``told`` what was found."""
-        for raw in frames:
-            frame, estimate = self.look(raw)
-            for tell in told:
-                tell(frame, estimate)
-            self.write(frame, estimate)
-            progress(self.done)
+        """All of them; ``progress`` is told how many frames are done, before that each of ``told`` what was found.
+        ``at_once``: as many are waited for before the first of them is tracked."""
+        for some in batches(frames, at_once):
+            self.tracker.look_ahead([raw.pixels for raw in some])
+            for raw in some:
+                frame, estimate = self.look(raw)
+                for tell in told:
+                    tell(frame, estimate)
+                self.write(frame, estimate)
+                progress(self.done)
 
     def look(self, frame: Frame) -> tuple[Frame, Estimate]:
         """What is found in one frame more, which may turn out to be damaged. ValueError if that is to be the end."""

@@ -32,6 +32,7 @@ from torch_ecc.io.stabilised import StabilisedWriter
 from torch_ecc.io.stacks import Stack
 from torch_ecc.io.summary import plain
 from torch_ecc.io.track import FILES
+from torch_ecc.track.lookahead import MOST
 from torch_ecc.track.tracker import Tracker
 
 STATUS_NAMES = {int(code): code.name for code in Status}
@@ -166,7 +167,8 @@ class Session:
             stopped: BaseException | None = None
             try:
                 with run, as_it_comes() if self.source.live else nullcontext():
-                    run.through(self._frames(left, pictures=bool(films)), progress, self.send, watch)
+                    at_once = 1 if self.source.live else MOST
+                    run.through(self._frames(left, pictures=bool(films)), progress, self.send, watch, at_once=at_once)
             except (KeyboardInterrupt, ValueError) as error:
                 stopped = error
             except OSError as error:

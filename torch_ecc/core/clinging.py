@@ -87,11 +87,12 @@ def explained(residuals: Residuals, grid: tuple[int, int]) -> tuple[Tensor, Tens
     """What clings together, see ``Clinging``, in residuals less those of the strain that fits them best, if they are
     it for certain."""
     effect, ratio, unit, gain, strains = residuals
+    effect = effect.to(unit.dtype)  # in which as many templates at once are judged as each alone
     strain, uncertain, certain = strained_by(strains, effect)
     strained = None
     if not (is_cpu(gain.device) and not any(certain.tolist())):
         effect = without_strain(strains, effect, strain * (certain > 0)[:, None])
-        ratio = (clustered(effect.to(unit.dtype), grid) * unit).view(-1, 3, 3)
+        ratio = (clustered(effect, grid) * unit).view(-1, 3, 3)
         square = strain[:, :, None] * strain[:, None] + uncertain
         strained = strained_pose(strains, square * (certain / gain.to(certain).square())[:, None, None])
     scatter = ratio[:, :1].clamp(min=1.0)

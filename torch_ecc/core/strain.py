@@ -53,7 +53,9 @@ def strains_of(reference: Reference, normal: Normal | None = None, share: Tensor
     pattern = torch.einsum("bkp,bpmn->bmkn", rows, left).flatten(2)
     weighted = pattern / spread.clamp(min=LEAST).flatten(1).unsqueeze(1)
     fit = safe_inverse(weighted @ pattern.mT)[0] @ weighted
-    return Strains(pattern, fit, shift[:, :3], parts.radius, few_lines(power.to(inverse.dtype), reference.grid.blocks))
+    lines = few_lines(power.to(inverse.dtype), reference.grid.blocks)
+    pattern, fit, shift = (value.to(inverse.dtype) for value in (pattern, fit, shift[:, :3]))
+    return Strains(pattern, fit, shift, parts.radius, lines)
 
 
 def few_lines(share: Tensor, grid: tuple[int, int]) -> Tensor:

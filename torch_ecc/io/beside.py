@@ -19,11 +19,11 @@ def ahead(items: Iterable[T]) -> Iterator[T]:
     Several at once: two threads that meet at every frame take a tenth more of a busy processor's time.
     """
     source, thread = iter(items), ThreadPoolExecutor(1, "ahead")
-    waiting = deque(thread.submit(_some, source) for _ in range(2))
+    waiting = deque(thread.submit(_some, source, _AHEAD) for _ in range(2))
     try:
         while True:
             made, error = waiting.popleft().result()
-            waiting.append(thread.submit(_some, source))
+            waiting.append(thread.submit(_some, source, _AHEAD))
             yield from made
             if error is not None:
                 raise error
@@ -35,11 +35,24 @@ def ahead(items: Iterable[T]) -> Iterator[T]:
         thread.shutdown(wait=False, cancel_futures=True)
 
 
-def _some(source: Iterator[T]) -> tuple[list[T], Exception | None]:
-    """The next few items, or all that come before an error, with that."""
+def batches(items: Iterable[T], count: int) -> Iterator[list[T]]:
+    """The same ``items``, so many at once, the last time fewer; those before an error come before it is raised."""
+    source = iter(items)
+    while True:
+        made, error = _some(source, count)
+        if made:
+            yield made
+        if error is not None:
+            raise error
+        if len(made) < count:
+            return
+
+
+def _some(source: Iterator[T], count: int) -> tuple[list[T], Exception | None]:
+    """The next items, so many or all that come before an error, with that."""
     made = list[T]()
     try:
-        made.extend(islice(source, _AHEAD))
+        made.extend(islice(source, count))
     except Exception as error:
         return made, error
     return made, None

@@ -13,6 +13,7 @@ from torch_ecc.core.reference import Reference
 from torch_ecc.core.robust import Memory
 from torch_ecc.core.sampling import is_cpu
 from torch_ecc.core.settings import Settings
+from torch_ecc.core.solution import Solution
 from torch_ecc.track.budget import BURST
 from torch_ecc.track.lined import lined, unknown_lines
 from torch_ecc.track.pinned import held
@@ -66,11 +67,17 @@ class Remembering:
         memory = Memory(state["score"], state["trust"], state["answered"], *self.put_off)
         estimate, found = solve_again(reference, self.image, pose, self.settings, state["start"], memory)
         self.odd, self.doubtful = found.odd, found.doubtful
-        if found.trust is None:
-            state["trust"].fill_(1)
-        else:
-            state["trust"].copy_(torch.where(Status.good(estimate.status)[:, None], found.trust, 1.0))
-        return lined(held(estimate, found, reference, state), found, reference, state)
+        return remembered(estimate, found, reference, state)
+
+
+def remembered(estimate: Estimate, found: Solution, reference: Reference, state: State) -> Estimate:
+    """The ``estimate`` (R, ...) of what was ``found`` in a frame, whose covariance tells of what the frames before have
+    shown, too."""
+    if found.trust is None:
+        state["trust"].fill_(1)
+    else:
+        state["trust"].copy_(torch.where(Status.good(estimate.status)[:, None], found.trust, 1.0))
+    return lined(held(estimate, found, reference, state), found, reference, state)
 
 
 def advanced(state: State, estimate: Estimate) -> Estimate:

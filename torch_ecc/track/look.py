@@ -17,13 +17,15 @@ from torch import Tensor
 from torch_ecc.core import implicit
 from torch_ecc.core.ambient import lasting
 from torch_ecc.core.estimate import Estimate
+from torch_ecc.core.native.engine import DEGREE, code_of
 from torch_ecc.core.pose import ahead
 from torch_ecc.core.reference import Reference, each
 from torch_ecc.core.settings import Settings
 from torch_ecc.core.sight import filled
 from torch_ecc.search.locate import image_pyramid
-from torch_ecc.track.advance import Remembering, State
+from torch_ecc.track.advance import Remembering, State, remembered
 from torch_ecc.track.coarse import coarse_to_fine
+from torch_ecc.track.lookahead import Foreseen
 from torch_ecc.track.shutter import Shutter
 
 WARM = 3  # looks before the one that is recorded: constants are made, kernels compiled and loaded
@@ -46,10 +48,15 @@ class Look:
     shown: Tensor | None
     graphs: dict[bool, Graph] = field(default_factory=dict, init=False)  # one, and another for what was put off
 
-    def __call__(self, image: Tensor, images: list[Tensor], search_first: bool = False) -> Result:
+    def __call__(
+        self, image: Tensor, images: list[Tensor], search_first: bool = False, seen: Foreseen | None = None
+    ) -> Result:
         """At an ``image`` (1 or R, 1, H, W), as ``core.frame.as_image`` has it; ``images`` holds it without gradients
         and grows to as many levels as there are. ``search_first``: what is gone is only named, if nothing else knows
-        where it may be."""
+        where it may be. ``seen``: what is known of it already."""
+        if seen is not None:
+            step, estimate = seen
+            return step.start, remembered(estimate, step.found, self.references[0], self.state), None, None
         alone = len(self.references) == 1 and self.shutter.line == 0
         if len(self.references) > 1 or not self.recordable(image):
             return self.made(image, images, False, search_first and alone)
@@ -60,6 +67,11 @@ class Look:
                 part.copy_(was)
             result = self.graph(image, put_off=False)(image)
         return *result[:3], None
+
+    @property
+    def own(self) -> bool:
+        """Whether the criterion or the sampler is somebody's own, which may use autograd."""
+        return code_of(self.references[0].criterion) is None or self.settings.interpolation not in DEGREE
 
     @property
     def kept(self) -> list[Tensor]:

@@ -14,7 +14,6 @@ from torch_ecc.core.ambient import lasting, plain, threads_for, unrecorded
 from torch_ecc.core.criteria import Criterion, make_criterion, named
 from torch_ecc.core.estimate import Estimate, Origin, Track
 from torch_ecc.core.frame import as_device, as_gray, as_image, require_as_first, require_tensor
-from torch_ecc.core.native.engine import DEGREE, code_of
 from torch_ecc.core.patches import Centers, Crop, Patches, Size, crop, locate_patches, unmarked
 from torch_ecc.core.pyramid import check_levels, pyramid
 from torch_ecc.core.reference import MARGIN, Reference, prepare
@@ -30,6 +29,7 @@ from torch_ecc.track.gone import searched_first
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told, with_new_parts
 from torch_ecc.track.light import told_of_light
 from torch_ecc.track.look import Look
+from torch_ecc.track.lookahead import Lookahead
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Recovery, from_rest
 from torch_ecc.track.sensor import dead_in, kept, shown
@@ -38,7 +38,7 @@ from torch_ecc.track.shutter import Shutter
 from torch_ecc.track.textureless import warn_of_textureless
 from torch_ecc.track.watch import Marks, Watch
 
-DERIVED = ("references", "_unmarked", "_look", "_marks", "_recovery", "_crowd", "_teacher", "_version")  # of the state
+DERIVED = ("references", "_unmarked", "_look", "_ahead", "_marks", "_recovery", "_crowd", "_teacher", "_version")
 
 
 class Tracker(nn.Module):
@@ -214,6 +214,7 @@ class Tracker(nn.Module):
         self._look = Look(self.references, self.settings, self.shutter, self._buffers, moving, self.frame_mask)
         alone = len(self.start) == 1 or self.frame_shape[0] > 1
         self._crowd = None if alone else Crowd(self.start[:, :2])
+        self._ahead = Lookahead(self._look, self._viewed, self.learns)
         sight = self.references[0].sight
         if self.learns:
             self._teacher = Teacher(self.criterion, self.settings.interpolation, self.rounds, sight and sight.shown)
@@ -253,7 +254,7 @@ class Tracker(nn.Module):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """Of copies and pickles: without what follows from the templates."""
+        """Of copies and pickles: without what follows from the state."""
         return {name: value for name, value in self.__dict__.items() if name not in DERIVED}
 
     @lasting
@@ -304,22 +305,20 @@ class Tracker(nn.Module):
         but for those that a search has found; the tracker's state does not. Raises ValueError for another shape, a
         wrong dtype, NaN.
         """
-        own = code_of(self.criterion) is None or self.settings.interpolation not in DEGREE  # which may use autograd
-        follow = self._forward if own or getattr(frame, "requires_grad", True) else unrecorded(self._forward)
+        follow = self._forward if self._look.own or getattr(frame, "requires_grad", True) else unrecorded(self._forward)
         with threads_for(self.template.numel()):
             return follow(frame)
 
     def _forward(self, frame: Tensor) -> Estimate:
         state: Any = self._buffers  # a module's attributes are slow
-        image = as_image("track", "frame", frame, state["pose"].device)
-        require_as_first("track", image, self.frame_shape)
+        seen = self._ahead(frame)
+        image = self._viewed(frame) if seen is None else seen.step.image
         if self.learns and self.template._version != self._version:  # by another handle of the same state
             self._use(self._prepared(self._buffers))
-        image = image if self.dead is None else self.dead.repair(image)
         images = [image.detach()]
         self._recovery.budget.earn()
         first = self.search and not image.requires_grad and self._recovery.comes_first(state["since"])
-        start, estimate, odd, gone = self._look(image, images, first)
+        start, estimate, odd, gone = self._look(image, images, first, seen)
         view, past = images[0], Past.of(state)
         if gone is not None and odd is not None:
             doubted = sum(suspect(estimate, state["score"]))
@@ -352,6 +351,12 @@ class Tracker(nn.Module):
         apart = told_of_light(apart, images[0], state, self.references[0].grid.sides)
         return self._learned(image, advanced_in_doubt(state, apart, suspects), suspects)
 
+    def _viewed(self, frame: Tensor) -> Tensor:
+        """A ``frame`` as an image. ValueError if it is none like the first one."""
+        image = as_image("track", "frame", frame, self._buffers["pose"].device)
+        require_as_first("track", image, self.frame_shape)
+        return image if self.dead is None else self.dead.repair(image)
+
     def _past_marks(self, image: Tensor, estimate: Estimate, start: Tensor, *which: Tensor | None) -> Estimate:
         """The ``estimate`` without marks of the camera: see ``Marks``."""
         if self._marks is None:
@@ -364,6 +369,12 @@ class Tracker(nn.Module):
     def track(self, frame: Tensor) -> Estimate:
         """Same as calling the tracker."""
         return self(frame)  # type: ignore[no-any-return]
+
+    def look_ahead(self, frames: Iterable[Tensor | None]) -> None:
+        """The next ``frames``, as those of a file are known before it is their turn: one template is then tracked in
+        half the time, on a CPU. They are the tensors that the tracker will be called with, and stay as they are until
+        then; no result depends on it, and nothing is done here."""
+        self._ahead.expect(frames)
 
     @torch.no_grad()
     def skip(self) -> Estimate:
@@ -386,4 +397,4 @@ class Tracker(nn.Module):
         ``stop_at_damage`` it ends by SequenceError, with the track so far, and so it does where ``frames`` itself
         raises a ValueError or brings something else than tensors.
         """
-        return tracked(self.track, self.skip, frames, stop_at_damage)
+        return tracked(self.track, self.skip, self.look_ahead, frames, stop_at_damage)
