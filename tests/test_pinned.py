@@ -16,6 +16,7 @@ from torch_ecc.sim.scene.pads import Pads
 from torch_ecc.sim.scene.speckle import Speckle
 from torch_ecc.sim.scene.waves import PlaneWaves
 from torch_ecc.track import pinned
+from torch_ecc.track.lined import NEVER, lined, nothing_due
 
 SHAPE, SIZE, HOME = (110, 120), 61, (60.0, 55.0)
 SCENES = 6
@@ -155,6 +156,27 @@ def test_a_sensor_without_lines_has_none(monkeypatch: pytest.MonkeyPatch) -> Non
             more = track.sigma / Tracker(frames[0], [HOME], SIZE).track_sequence(frames[1:]).sigma
         assert more.min() >= 1
         assert more.max() < 1.1
+
+
+def test_the_host_sees_where_no_lines_pull(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever it says so nothing changes, and it says so wherever one is far along both axes."""
+    image = Speckle.random(seed=0).render(poses(torch.zeros(0, 2)), SHAPE).float()
+    reference, source, said = prepare(image[0, :, 30:91, 30:91]), torch.Generator().manual_seed(0), []
+    estimate, found = solve_again(reference, image, torch.tensor([[60.0, 60.0, 0.0]], dtype=torch.float64), Settings())
+    for _ in range(60):
+        moved, power, due = (torch.rand(2, generator=source, dtype=torch.float64) for _ in range(3))
+        moved, power = torch.cat((8 * moved - 4, 2 * moved[:1])), power.masked_fill(power < 0.3, 0.0)
+        due = torch.where(due < 0.1, 3.0, NEVER)
+        there = estimate._replace(pose=estimate.pose + moved, displacement=moved[None], status=estimate.status * 0)
+        state = {"lines": torch.stack((power, due), 1)[None]}
+        said.append(nothing_due(state["lines"].tolist(), moved[None, :2].tolist(), there.pose[:, 2].tolist()))
+        with monkeypatch.context() as alone:
+            alone.setattr("torch_ecc.track.lined.nothing_due", lambda *_: False)
+            changed = not torch.equal(lined(there, found, reference, state).covariance, there.covariance)
+        assert not (said[-1] and changed)
+        asked = bool((moved[:2].abs() > due).any())
+        assert said[-1] == (not asked and not changed)
+    assert 15 < sum(said) < 45
 
 
 @pytest.mark.parametrize("axis", [0, 1])

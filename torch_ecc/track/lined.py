@@ -17,6 +17,7 @@ from 0.3 to 2 px). No more can be theirs than the template has of it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import cos, sin
 
 import torch
 from torch import Tensor
@@ -43,7 +44,7 @@ def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapp
     it is to be asked for, again and again."""
     lines, moved = state["lines"], estimate.displacement.detach()[:, :2]
     on_cpu = is_cpu(moved.device)
-    if on_cpu and nothing_due(lines.tolist(), moved.tolist()):
+    if on_cpu and nothing_due(lines.tolist(), moved.tolist(), estimate.pose[:, 2].tolist()):
         return estimate
     (power, due), reach = lines.unbind(2), moved.abs()
     farther = reach > due
@@ -64,10 +65,17 @@ def lined(estimate: Estimate, found: Solution, reference: Reference, state: Mapp
     return uncertain(estimate, torch.bmm(normal.inverse[:, :3, :3], normal.bread_bias[:, :, :2] * pull.unsqueeze(1)))
 
 
-def nothing_due(lines: list[list[list[float]]], moved: list[list[float]]) -> bool:
-    """Whether the host sees at once that no lines are known, and there is nothing to ask for."""
-    axes = (pair for each in zip(lines, moved, strict=True) for pair in zip(*each, strict=True))
-    return all(power == 0 and abs(d) <= due for (power, due), d in axes)
+def nothing_due(lines: list[list[list[float]]], moved: list[list[float]], theta: list[float]) -> bool:
+    """Whether the host sees at once that there is nothing to ask for, and no lines that are known pull from so far."""
+    for each, (x, y), turned in zip(lines, moved, theta, strict=True):
+        (power_x, due_x), (power_y, due_y) = each
+        if abs(x) > due_x or abs(y) > due_y:
+            return False
+        if power_x > 0 or power_y > 0:
+            c, s = cos(turned), sin(turned)
+            if (power_x > 0 and abs(c * x - s * y) <= FAR) or (power_y > 0 and abs(c * y + s * x) <= FAR):
+                return False
+    return True
 
 
 def unknown_lines(start: Tensor) -> Tensor:
