@@ -165,7 +165,7 @@ def test_the_host_sees_where_no_lines_pull(monkeypatch: pytest.MonkeyPatch) -> N
     estimate, found = solve_again(reference, image, torch.tensor([[60.0, 60.0, 0.0]], dtype=torch.float64), Settings())
     for _ in range(60):
         moved, power, due = (torch.rand(2, generator=source, dtype=torch.float64) for _ in range(3))
-        moved, power = torch.cat((8 * moved - 4, 2 * moved[:1])), power.masked_fill(power < 0.3, 0.0)
+        moved, power = torch.cat((16 * moved - 8, 2 * moved[:1])), power.masked_fill(power < 0.3, 0.0)
         due = torch.where(due < 0.1, 3.0, NEVER)
         there = estimate._replace(pose=estimate.pose + moved, displacement=moved[None], status=estimate.status * 0)
         state = {"lines": torch.stack((power, due), 1)[None]}
