@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
 import torch
@@ -29,6 +29,17 @@ Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 
 CONSTANT = ("template", "mask", "centre", "first", *LESSONS)  # of a state, or too large for a journal
 SELDOM = ("marks", "heed")  # does it change: too large to be in a journal with every frame
+
+
+class Looked(NamedTuple):
+    """What was found in a ``frame``, as tracked and as ``shown`` in pictures; the ``state`` then, and the ``change`` of
+    what seldom changes."""
+
+    frame: Frame
+    estimate: Estimate
+    shown: Estimate
+    state: bytes
+    change: bytes
 
 
 class Run:
@@ -72,34 +83,38 @@ class Run:
         ``at_once``: as many are waited for before the first of them is tracked."""
         for some in batches(frames, at_once):
             self.tracker.look_ahead([raw.pixels for raw in some])
-            for raw in some:
-                frame, estimate = self.look(raw)
-                for tell in told:
-                    tell(frame, estimate)
-                self.write(frame, estimate)
-                progress(self.done)
+            looks = list[Looked]()
+            try:
+                looks.extend(map(self.look, some))
+            finally:  # those before one that ends the run
+                for look in looks:
+                    for tell in told:
+                        tell(look.frame, look.estimate)
+                    self.write(look)
+                    progress(self.done)
 
-    def look(self, frame: Frame) -> tuple[Frame, Estimate]:
+    def look(self, frame: Frame) -> Looked:
         """What is found in one frame more, which may turn out to be damaged. ValueError if that is to be the end."""
         try:
             if frame.pixels is None:
                 raise ValueError(frame.damage)
             estimate: Estimate = self.tracker(frame.pixels)
+            self.latency.add(frame)
         except ValueError as error:
             if self.stop_at_damage:
                 raise ValueError(f"frame {frame.number}: {error}") from error
             self.damage = self.damage or f"frame {frame.number} ({error})"
-            return dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
-        self.latency.add(frame)
-        return frame, estimate
-
-    def write(self, frame: Frame, estimate: Estimate) -> None:
-        """Append what was found in a frame to all files."""
+            frame, estimate = dataclasses.replace(frame, pixels=None, damage=str(error)), self.tracker.skip()
         shown = estimate if self.body is None else drawn_with(self.body(estimate), estimate, self.body.lens)
         views = self._views or [part.cpu().numpy() for part in self._state]
-        self.track.write(estimate, frame, b"".join(view.tobytes() for view in views), self._change())
+        return Looked(frame, estimate, shown, b"".join(view.tobytes() for view in views), self._change())
+
+    def write(self, look: Looked) -> None:
+        """Append what was found in a frame to all files."""
+        frame, estimate = look.frame, look.estimate
+        self.track.write(estimate, frame, look.state, look.change)
         for film in self.films:
-            film.write(frame, shown if isinstance(film, OverlayWriter) else estimate)
+            film.write(frame, look.shown if isinstance(film, OverlayWriter) else estimate)
         self._count(*(code.cpu().numpy()[None] for code in (estimate.status, estimate.reason)))
 
     def _change(self) -> bytes:
