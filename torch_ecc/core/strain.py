@@ -79,11 +79,11 @@ def by_chance(n: Tensor) -> Tensor:
 def strained_by(strains: Strains, effect: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The strains (B, 7) that an ``effect`` (B, 3, blocks) on the pose is best explained by; the covariance (B, 7, 7)
     of what else each block adds to them; and how much of their square is no chance, (B,), 0 to 1."""
-    flat = effect.flatten(1).unsqueeze(2)
-    strain = strains.fit @ flat
-    left = torch.baddbmm(flat, strains.pattern.mT, strain, alpha=-1).mT
+    flat = effect.flatten(1).unsqueeze(1)
+    strain = flat @ strains.fit.mT
+    left = torch.baddbmm(flat, strain, strains.pattern, alpha=-1)
     of_blocks = (strains.fit * left).unflatten(2, effect.shape[1:]).sum(2)
-    uncertain, strain = of_blocks @ of_blocks.mT, strain.squeeze(2)
+    uncertain, strain = of_blocks @ of_blocks.mT, strain.squeeze(1)
     return strain, uncertain, (1 - BY_CHANCE / ratio_of_squares(strain, uncertain)).clamp(min=0)
 
 
