@@ -95,3 +95,17 @@ def test_track(benchmark: Benchmark, work: Work, interpolation: str, backend: st
     )
     frames = itertools.cycle([*work.frames, *work.frames.flip(0)])
     benchmark(lambda: tracker(next(frames)))
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_sequence(benchmark: Benchmark, work: Work, ahead: bool):
+    """To and fro through frames that are there already, all of them in one round, and looked at ahead or not."""
+    tracker, frames = te.Tracker(work.frames[0], [work.center], work.size), [*work.frames, *work.frames.flip(0)]
+
+    def followed() -> None:
+        tracker.look_ahead(frames if ahead else ())
+        for frame in frames:
+            tracker(frame)
+
+    benchmark(followed)
+    benchmark.extra_info["frames"] = len(frames)

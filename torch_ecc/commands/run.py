@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,6 +29,7 @@ from torch_ecc.track.tracker import Tracker
 Pictures: TypeAlias = OverlayWriter | StabilisedWriter
 
 CONSTANT = ("template", "mask", "centre", "first", *LESSONS)  # of a state, or too large for a journal
+PIXELS_AT_ONCE = 2**26  # of frames that wait in memory
 SELDOM = ("marks", "heed")  # does it change: too large to be in a journal with every frame
 
 
@@ -77,11 +79,12 @@ class Run:
         frames: Iterable[Frame],
         progress: Callable[[int], None],
         *told: Callable[[Frame, Estimate], None],
-        at_once: int = MOST,
+        live: bool = False,
     ) -> None:
         """All of them; ``progress`` is told how many frames are done, before that each of ``told`` what was found.
-        ``at_once``: as many are waited for before the first of them is tracked."""
-        for some in batches(frames, at_once):
+        Unless they come ``live`` some are waited for before the first of them is tracked."""
+        most = max(min(MOST, PIXELS_AT_ONCE // math.prod(self.tracker.frame_shape)), 1)
+        for some in batches(frames, 1 if live else most):
             self.tracker.look_ahead([raw.pixels for raw in some])
             looks = list[Looked]()
             try:

@@ -32,7 +32,6 @@ from torch_ecc.io.stabilised import StabilisedWriter
 from torch_ecc.io.stacks import Stack
 from torch_ecc.io.summary import plain
 from torch_ecc.io.track import FILES
-from torch_ecc.track.lookahead import MOST
 from torch_ecc.track.tracker import Tracker
 
 STATUS_NAMES = {int(code): code.name for code in Status}
@@ -167,8 +166,8 @@ class Session:
             stopped: BaseException | None = None
             try:
                 with run, as_it_comes() if self.source.live else nullcontext():
-                    at_once = 1 if self.source.live else MOST
-                    run.through(self._frames(left, pictures=bool(films)), progress, self.send, watch, at_once=at_once)
+                    frames, live = self._frames(left, pictures=bool(films)), self.source.live
+                    run.through(frames, progress, self.send, watch, live=live)
             except (KeyboardInterrupt, ValueError) as error:
                 stopped = error
             except OSError as error:

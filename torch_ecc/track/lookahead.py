@@ -32,8 +32,8 @@ from torch_ecc.track.advance import MEMORY, State
 if TYPE_CHECKING:
     from torch_ecc.track.look import Look
 
-MOST = 8  # frames
-LONGEST = 63  # frames that are not looked at ahead, after one of those that were has turned out not to be ordinary
+MOST = 16  # frames
+DOUBLINGS = 6  # of the frames after one has looked ahead in vain, until one does so again, at fewer
 
 View = Callable[[Tensor], Tensor]
 
@@ -103,7 +103,7 @@ class Lookahead:
         self.coming: deque[Tensor | None] = deque()
         self.foreseen: deque[Foreseen] = deque()
         self.careful = False  # whether something has not been ordinary in the last look
-        self.left = self.pause = 0  # frames until one looks ahead again: now, and after the next failure
+        self.failures = self.pause = 0  # in a row, and frames until one looks ahead again
 
     def expect(self, frames: Iterable[Tensor | None]) -> None:
         """These are the next ones."""
@@ -115,17 +115,17 @@ class Lookahead:
         while self.coming and self.coming.popleft() is not frame:
             self.foreseen.clear()
         if not self.foreseen:
-            if self.left > 0 or not self.coming:
-                self.left = max(self.left - 1, 0)
+            if self.pause > 0 or not self.coming:
+                self.pause = max(self.pause - 1, 0)
                 return None
-            self.look([frame, *islice(self.coming, MOST - 1)])
+            self.look([frame, *islice(self.coming, max(MOST >> self.failures, 2) - 1)])
         seen = self.foreseen.popleft() if self.foreseen else None
         if seen is None or not seen.is_of(frame, Known.of(self.state)):
             self.foreseen.clear()
-            self.left, self.pause = self.pause, min(2 * self.pause + 1, LONGEST)
+            self.pause, self.failures = 2**self.failures - 1, min(self.failures + 1, DOUBLINGS)
             return None
         if not self.foreseen:
-            self.left, self.pause = int(self.careful), 0  # for the frame that is not ordinary
+            self.pause, self.failures = int(self.careful), 0  # for the frame that is not ordinary
         return seen
 
     def look(self, frames: list[Tensor | None]) -> None:

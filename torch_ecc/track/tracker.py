@@ -372,7 +372,7 @@ class Tracker(nn.Module):
 
     def look_ahead(self, frames: Iterable[Tensor | None]) -> None:
         """The next ``frames``, as those of a file are known before it is their turn: one template is then tracked in
-        half the time, on a CPU. They are the tensors that the tracker will be called with, and stay as they are until
+        0.6 of the time, on a CPU. They are the tensors that the tracker will be called with, and stay as they are until
         then; no result depends on it, and nothing is done here."""
         self._ahead.expect(frames)
 
