@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torch_ecc import Status, Tracker
 from torch_ecc.sim.scene.waves import PlaneWaves
+from torch_ecc.track.still import Still
 
 SHAPE, SIZE, CENTER = (150, 160), 81, [(79.0, 75.0)]
 SCENE, BEHIND = PlaneWaves.random(seed=3), PlaneWaves.random(seed=8)
@@ -154,12 +155,16 @@ def test_a_told_mask_is_the_last_word() -> None:
     assert not tracker.marks.any()
 
 
-def test_a_coder_brings_no_pose_into_doubt() -> None:
-    """What it leaves stands still, too, next to where a template was cut; but all blocks say the same of the pose."""
+def test_a_coder_brings_no_pose_into_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it leaves stands still, too, next to where a template was cut; but all blocks say the same of the pose, and
+    none looks like a mark: it is never tracked without."""
+    tried = []
+    monkeypatch.setattr(Still, "trial", lambda *_: tried.append(0))
     motion = path(count=8, step=0.2)
     frames = torch.from_numpy(np.stack([through_jpeg(frame.numpy()) for frame in filmed(motion)]))
     track = Tracker(frames[0], CENTER, SIZE).track_sequence(frames[1:])
     error = off(track, motion)
+    assert not tried
     assert (track.sigma[:, 0, :2] < 0.1).all()
     assert (error < 5 * track.sigma[:, 0]).all()
 

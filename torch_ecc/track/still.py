@@ -40,6 +40,7 @@ AROUND = 3  # px: pixels are compared in squares of so many
 STILL = 3.0  # times the noise of a difference: so much is left of squares that stand still
 EXCESS = 9.0  # times it, and
 CONTRAST = 0.2  # of the template's, must be left by the template, which light and the sampler do not leave
+NEARLY, MORE = 0.4, 1.15  # of what a mark leaves, times what the rest does: in 40 marks at least 0.5, or 1.5
 BELIEVED = 0.95  # of what is in sight must fit without the marks
 BY_CHANCE = 3.0  # standard deviations of what noise may leave
 QUIET, TO_MEAN = 0.3, 1.41  # a quantile of what noise leaves of squares, and their mean over it
@@ -73,10 +74,22 @@ class Look(NamedTuple):
         return (self.changed < STILL * self.noise) & (self.texture > CONTRAST**2 * self.contrast)
 
     @property
+    def most(self) -> float:
+        """What may be left of a square without a mark."""
+        return max(EXCESS * self.noise, CONTRAST**2 * self.contrast)
+
+    @property
     def marks(self) -> Tensor:
         """What stands still and should not (h, w)."""
-        most = max(EXCESS * self.noise, CONTRAST**2 * self.contrast)
-        return (self.changed < STILL * self.noise) & (self.left > most)
+        return (self.changed < STILL * self.noise) & (self.left > self.most)
+
+    @property
+    def strange(self) -> bool:
+        """Whether anything that stands still leaves nearly so much, or more of it is left than of the rest: else no
+        pose is bent by it."""
+        still = self.still
+        left, rest = self.left[still], self.left[~still]
+        return len(left) > 0 and bool((left.max() > NEARLY * self.most) | (left.mean() > MORE * rest.mean()))
 
     def within(self, part: Tensor, like: Tensor) -> Tensor:
         """A ``part`` (h, w) of it as one of a frame ``like`` (H, W)."""
@@ -322,7 +335,7 @@ class Still(NamedTuple):
         if trial is not None or self.pure:
             return trial
         seen = look(self, pose, self.reference)
-        trial = self.trial(self.shown & ~seen.within(seen.still, self.shown))
+        trial = self.trial(self.shown & ~seen.within(seen.still, self.shown)) if seen.strange else None
         if trial is None or not Status.good(trial.estimate.status):
             return None
         return self.told(trial.estimate.pose, trial.reference)
