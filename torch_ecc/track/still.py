@@ -119,15 +119,16 @@ def looked(still: Still, pose: Tensor, contrast: float, through_coder: bool) -> 
     expected, known = projected(reference, now, pixels, (y1 - y0, x1 - x0))
     known &= still.shown[y0:y1, x0:x1]
     left = unexplained(view[None], torch.where(known, expected, torch.nan)[None], expected[None])[0]
-    left = mean(torch.where(known, left, 0.0).square())
+    images = torch.where(known, left, 0.0).square(), (view - before).square(), expected, before
+    left, changed, *means = mean(*images, expected.square(), before.square())
+    of_template, texture = (square - once.square() for once, square in zip(means[:2], means[2:], strict=True))
     noise = 2 * max(float(reference.noise.of_frame), LEAST_NOISE**2 * contrast)
     if through_coder and bool(known.any()):
-        noise = coded(noise, left[known], variance(expected)[known], MOST_NOISE * contrast)
-    changed = mean((view - before).square())
+        noise = coded(noise, left[known], of_template[known], MOST_NOISE * contrast)
     new = torch.where(changed < STILL * noise, 0.0, left)  # else a mark may have come to be there
     since = composed(now, inverted(home))[None]  # from where a pixel was to where that is now
     own = torch.where(inside(since, pixels, view.shape), picked(new, since, pixels), 0.0).view(view.shape)
-    return Look((y0, x0), changed, left if still.pure else left.maximum(own), variance(before), noise, contrast)
+    return Look((y0, x0), changed, left if still.pure else left.maximum(own), texture, noise, contrast)
 
 
 def coded(noise: float, left: Tensor, texture: Tensor, most: float) -> float:
@@ -183,18 +184,13 @@ def images(reference: Reference) -> tuple[Tensor, Tensor]:
     return whole[0], whole[1]
 
 
-def mean(image: Tensor) -> Tensor:
-    """Over squares of AROUND px, (h, w)."""
-    both = torch.stack((image, torch.ones_like(image)))
+def mean(*images: Tensor) -> Tensor:
+    """Of n images (h, w) over squares of AROUND px, (n, h, w)."""
+    total = torch.stack((*images, torch.ones_like(images[0])))
     for axis in (1, 2):
-        n, wide = both.shape[axis], F.pad(both, (0, 0, AROUND // 2, AROUND // 2) if axis == 1 else (AROUND // 2,) * 2)
-        both = sum((wide.narrow(axis, k, n) for k in range(1, AROUND)), wide.narrow(axis, 0, n))
-    return both[0] / both[1]
-
-
-def variance(image: Tensor) -> Tensor:
-    """Within squares of AROUND px, (h, w)."""
-    return mean(image.square()) - mean(image).square()
+        n, wide = total.shape[axis], F.pad(total, (0, 0, AROUND // 2, AROUND // 2) if axis == 1 else (AROUND // 2,) * 2)
+        total = sum((wide.narrow(axis, k, n) for k in range(1, AROUND)), wide.narrow(axis, 0, n))
+    return total[:-1] / total[-1]
 
 
 def behind(reference: Reference, home: Tensor, marks: Tensor, which: Tensor) -> Reference:

@@ -186,7 +186,8 @@ class Marks:
     def still(self, at: Tensor, image: Tensor, start: Tensor, pure: bool) -> Still:
         """The template ``at`` (1,)."""
         watch, state = Watch.of(self.state), self.state
-        alone, first = self.reference.through(None).select(at), state["first"][0, 0]
+        whole, first = self.reference.through(None), state["first"][0, 0]
+        alone = whole if len(whole.K) == 1 else whole.select(slice(int(at), int(at) + 1))
         shown, home = watch.marks == 0, state["start"][at]
         return Still(alone, image, first, watch.level, start[at], home, shown, pure, self.settings, [])
 
