@@ -189,3 +189,18 @@ def test_rounding_moves_no_patch_as_a_whole(interpolation):
         apart = apart / sampler.scale()
     assert apart.mean(2).abs().max() < 1.5e-6  # float32 holds such places to 1e-5 px
     assert apart.abs().max() < 5e-5
+
+
+@pytest.mark.parametrize("n", [40, 300])
+def test_no_filter_holds_what_processors_are_slow_with(n):
+    """Far off the diagonal there are zeros in place of subnormal numbers; near it all is as it is."""
+    made = [S._slope_matrix(n, torch.device("cpu")), *(S._alias(n, name, torch.device("cpu")) for name in S.SAMPLERS)]
+    for kernel in S.SAMPLERS.values():
+        if kernel.ring:
+            for dtype in (torch.float32, torch.float64):
+                made.append(S.prefilter_matrix(n, kernel.taps, kernel.ring, dtype, torch.device("cpu")))
+                inverse = made[-1][kernel.ring : n + kernel.ring].double()
+                restored = S._band(n, kernel.taps, 1, torch.device("cpu")) @ inverse
+                torch.testing.assert_close(restored, torch.eye(n, dtype=torch.float64), rtol=0, atol=1e-6)
+    for matrix in made:
+        assert (matrix[matrix != 0].abs() > 1e-25).all()
