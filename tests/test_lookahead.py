@@ -17,7 +17,7 @@ from torch_ecc.core.native import engine
 from torch_ecc.sim.scene.waves import PlaneWaves
 from torch_ecc.track import lookahead
 
-SIZE, FRAME, MIDDLE, COUNT = 61, (130, 140), (69.0, 64.0), 28
+SIZE, FRAME, MIDDLE, COUNT = 61, (130, 140), (69.0, 64.0), 26
 SCENE = PlaneWaves.random(seed=3)
 
 
@@ -92,16 +92,6 @@ def assert_same(one: Tracker, other: Tracker, *tracks: Track) -> None:
         torch.testing.assert_close(a, b, rtol=0, atol=1e-9, msg=name)
 
 
-@pytest.mark.parametrize(("what", "how"), [*((f, "as ever") for f in FILMS), *(("covered", o) for o in OPTIONS)])
-def test_it_is_found_as_without(what: str, how: str):
-    """Poses, covariances, status, and what the tracker knows in the end."""
-    frames, options = FILMS[what], OPTIONS.get(how, {})
-    frames = frames[:12] if how == "torch" else frames
-    here, there = tracker_of(frames, **options), tracker_of(frames, **options)
-    there.look_ahead(some := list(frames))
-    assert_same(here, there, one_by_one(here, list(frames)), one_by_one(there, some))
-
-
 def counted(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[int]:
     """Calls of a module's function, which goes on as before."""
     calls, function = [0], getattr(module, name)
@@ -124,14 +114,16 @@ def test_most_frames_are_judged_together(monkeypatch: pytest.MonkeyPatch):
         assert solved[0] == COUNT
 
 
-@pytest.mark.parametrize("what", FILMS)
-def test_what_is_in_vain_is_not_done_again_and_again(what: str, monkeypatch: pytest.MonkeyPatch):
-    """Where little is ordinary frames are solved hardly more often."""
-    steps, frames = counted(monkeypatch, lookahead, "ahead"), list(FILMS[what])
-    tracker = tracker_of(FILMS[what])
-    tracker.look_ahead(frames)
-    one_by_one(tracker, frames)
-    assert steps[0] <= 1.5 * COUNT
+@pytest.mark.parametrize(("what", "how"), [*((f, "as ever") for f in FILMS), *(("covered", o) for o in OPTIONS)])
+def test_it_is_found_as_without(what: str, how: str, monkeypatch: pytest.MonkeyPatch):
+    """Poses, covariances, status, and what the tracker knows in the end; and where little is ordinary frames are solved
+    hardly more often."""
+    frames, options = FILMS[what], OPTIONS.get(how, {})
+    frames = frames[:12] if how == "torch" else frames
+    steps, here, there = counted(monkeypatch, lookahead, "ahead"), *(tracker_of(frames, **options) for _ in range(2))
+    there.look_ahead(some := list(frames))
+    assert_same(here, there, one_by_one(here, list(frames)), one_by_one(there, some))
+    assert steps[0] <= COUNT + lookahead.MOST
 
 
 def test_a_tracker_that_is_told_where_to_look_looks_there(monkeypatch: pytest.MonkeyPatch):
