@@ -153,6 +153,19 @@ def test_a_frame_that_has_changed_since_is_another_one():
     assert_same(here, there, *map(Track.stack, tracks))
 
 
+def test_a_look_ahead_in_inference_mode_leaves_nothing_behind():
+    """Whatever mode the frames come in: what is found outside of it may be written to."""
+    frames = list(FILMS["plain"])
+    here, there = tracker_of(FILMS["plain"]), tracker_of(FILMS["plain"])
+    there.look_ahead(frames)
+    tracks = one_by_one(here, frames), []
+    for k, frame in enumerate(frames):
+        with torch.inference_mode(k % 7 < 4):
+            tracks[1].append(there(frame))
+        assert all(value.is_inference() == (k % 7 < 4) for value in tracks[1][-1])
+    assert_same(here, there, tracks[0], Track.stack(tracks[1]))
+
+
 def test_damaged_frames_are_where_they_are():
     """Missing, of another size, not finite: each is skipped in its turn, as it is by who does not look ahead."""
     frames = list(FILMS["plain"])

@@ -37,6 +37,8 @@ DOUBLINGS = 6  # of the frames after one has looked ahead in vain, until one doe
 
 View = Callable[[Tensor], Tensor]
 
+inference: Callable[[], bool] = torch.is_inference_mode_enabled
+
 
 class Known(NamedTuple):
     """What a tracker of one template knows before a frame: ``pose``, ``velocity`` (1, 3) and usual ``score`` (1,)."""
@@ -70,9 +72,11 @@ class Foreseen(NamedTuple):
     estimate: Estimate
 
     def is_of(self, frame: Tensor, known: Known) -> bool:
-        """Whether that is this ``frame``, unchanged, and that of one who has ``known`` this."""
+        """Whether that is this ``frame``, unchanged, that of one who has ``known`` this, and may be used here."""
         step = self.step
-        return step.frame is frame and step.version == frame._version and all(map(torch.equal, step.known, known))
+        if step.frame is not frame or step.version != frame._version or step.start.is_inference() != inference():
+            return False
+        return all(map(torch.equal, step.known, known))
 
 
 class Noted(Push):
