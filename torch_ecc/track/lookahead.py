@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from functools import cache, partial
 from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -100,10 +100,9 @@ class Lookahead:
 
     def __init__(self, look: Look, view: View, learns: bool) -> None:
         self.reference, self.settings, self.state = look.references[0], look.settings, look.state
-        self.moving, self.view, self.copies = look.moving, view, dict[int, Reference]()
+        self.moving, self.view, self.copies = look.moving, view, cache(self.reference.copies)
         alone = len(self.reference.K) == len(look.references) == 1 and is_cpu(self.reference.K.device)
-        if alone and not (learns or look.own or look.shutter.line or self.reference.sight):
-            self.copies = {n: self.reference.copies(n) for n in range(1, MOST + 1)}
+        self.gains = alone and not (learns or look.own or look.shutter.line or self.reference.sight)
         self.coming: deque[Tensor | None] = deque()
         self.foreseen: deque[Foreseen] = deque()
         self.careful = False  # whether something has not been ordinary in the last look
@@ -111,7 +110,7 @@ class Lookahead:
 
     def expect(self, frames: Iterable[Tensor | None]) -> None:
         """These are the next ones."""
-        self.coming = deque(frames if self.copies else ())
+        self.coming = deque(frames if self.gains else ())
         self.foreseen.clear()
 
     def __call__(self, frame: Tensor) -> Foreseen | None:
@@ -161,7 +160,7 @@ class Lookahead:
 
     def judged(self, chain: list[Step]) -> Iterator[Foreseen]:
         """Those of a ``chain`` before the first one that is not ordinary."""
-        many, settings, image = self.copies[len(chain)], self.settings, chain[0].image
+        many, settings, image = self.copies(len(chain)), self.settings, chain[0].image
         start = torch.cat([step.start for step in chain])
         pose, error, iterations, gain, sums, total = (
             torch.cat(values) for values in zip(*(step.found[:6] for step in chain), strict=True)
