@@ -82,9 +82,9 @@ class Run:
         live: bool = False,
     ) -> None:
         """All of them; ``progress`` is told how many frames are done, before that each of ``told`` what was found.
-        Unless they come ``live`` some are waited for before the first of them is tracked."""
-        most = max(min(MOST, PIXELS_AT_ONCE // math.prod(self.tracker.frame_shape)), 1)
-        for some in batches(frames, 1 if live else most):
+        Unless they come ``live`` some are waited for before the first of them is tracked, if that takes no time."""
+        most = min(MOST // len(self.lost), PIXELS_AT_ONCE // math.prod(self.tracker.frame_shape))
+        for some in batches(frames, 1 if live else max(most, 1)):
             self.tracker.look_ahead([raw.pixels for raw in some])
             looks = list[Looked]()
             try:
