@@ -105,13 +105,20 @@ def counted(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[int
 
 
 def test_most_frames_are_judged_together(monkeypatch: pytest.MonkeyPatch):
-    """Eight by one verdict, and none is solved twice."""
+    """Sixteen by one verdict, and none is solved twice; also of a tracker that is made anew in between."""
     together, alone = counted(monkeypatch, lookahead, "judge"), counted(monkeypatch, align, "judge")
     solved, frames = counted(monkeypatch, engine, "solve"), FILMS["plain"]
     tracker_of(frames).track_sequence(frames)
     assert (alone[0], together[0]) == (0, -(-COUNT // lookahead.MOST))
     if solved[0]:
         assert solved[0] == COUNT
+    tracker = tracker_of(frames)
+    tracker.look_ahead(frames)
+    for k, frame in enumerate(frames):  # another object than the one before, in the same place
+        if k == 5:
+            tracker.load_state_dict(tracker.state_dict())
+        tracker(frame)
+    assert (alone[0], together[0]) == (0, 2 + 3)
 
 
 @pytest.mark.parametrize(("what", "how"), [*((f, "as ever") for f in FILMS), *(("covered", o) for o in OPTIONS)])
@@ -201,10 +208,19 @@ def test_poses_of_frames_that_require_grad_have_theirs():
     for k in (3, 4, 9):
         frames[k].requires_grad_()
     tracker = tracker_of(FILMS["plain"])
-    track = tracker.track_sequence(frames)
-    for k in (3, 4, 9):
-        (slope,) = torch.autograd.grad(track.pose[k, 0, 0], frames[k], retain_graph=True)
+    tracker.look_ahead(frames)
+    poses = []
+    for k, frame in enumerate(frames):
+        poses.append(tracker(frame.requires_grad_(k in (3, 4, 6, 9))).pose[0, 0])  # of the third nobody knew
+    for k in (3, 4, 6, 9):
+        (slope,) = torch.autograd.grad(poses[k], frames[k])
         assert slope.abs().max() > 0
+
+
+def test_frames_that_are_not_there_are_refused():
+    """A generator may have no end."""
+    with pytest.raises(ValueError, match="look_ahead: expected a list or a tensor of frames, got generator"):
+        tracker_of(FILMS["plain"]).look_ahead(frame for frame in FILMS["plain"])
 
 
 @pytest.mark.parametrize("options", [{"average": 4}, {"levels": 2}, {"line_time": 1e-5, "fps": 50.0}])

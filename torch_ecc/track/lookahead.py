@@ -10,7 +10,7 @@ that is found depends on this.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
@@ -38,6 +38,14 @@ DOUBLINGS = 6  # of the frames after one has looked ahead in vain, until one doe
 View = Callable[[Tensor], Tensor]
 
 inference: Callable[[], bool] = torch.is_inference_mode_enabled
+
+
+def same(one: Tensor | None, frame: Tensor) -> bool:
+    """Whether both are ``one`` place in memory, as what a stack of frames gives each time it is asked for one."""
+    if one is frame or not (isinstance(one, Tensor) and isinstance(frame, Tensor)):
+        return one is frame
+    alike = one.shape == frame.shape and one.dtype == frame.dtype and one.stride() == frame.stride()
+    return alike and one.data_ptr() == frame.data_ptr()
 
 
 class Known(NamedTuple):
@@ -74,9 +82,9 @@ class Foreseen(NamedTuple):
     def is_of(self, frame: Tensor, known: Known) -> bool:
         """Whether that is this ``frame``, unchanged, that of one who has ``known`` this, and may be used here."""
         step = self.step
-        if step.frame is not frame or step.version != frame._version or step.start.is_inference() != inference():
+        if not same(step.frame, frame) or step.version != frame._version or frame.requires_grad:
             return False
-        return all(map(torch.equal, step.known, known))
+        return step.start.is_inference() == inference() and all(map(torch.equal, step.known, known))
 
 
 class Noted(Push):
@@ -96,26 +104,32 @@ class Noted(Push):
 
 class Lookahead:
     """Of a tracker that has this ``look`` at frames, of which a ``view`` makes images, or raises ValueError. There is
-    none where its template ``learns``, or there are several: only one costs less to solve than to judge."""
+    none where its template ``learns``, or there are several: only one costs less to solve than to judge. ``before``:
+    what the tracker had, whose frames are still to come."""
 
-    def __init__(self, look: Look, view: View, learns: bool) -> None:
+    def __init__(self, look: Look, view: View, learns: bool, before: Lookahead | None) -> None:
         self.reference, self.settings, self.state = look.references[0], look.settings, look.state
         self.moving, self.view, self.copies = look.moving, view, cache(self.reference.copies)
         alone = len(self.reference.K) == len(look.references) == 1 and is_cpu(self.reference.K.device)
         self.gains = alone and not (learns or look.own or look.shutter.line or self.reference.sight)
-        self.coming: deque[Tensor | None] = deque()
         self.foreseen: deque[Foreseen] = deque()
+        self.coming: deque[Tensor | None] = deque()
         self.careful = False  # whether something has not been ordinary in the last look
         self.failures = self.pause = 0  # in a row, and frames until one looks ahead again
+        if before is not None and self.gains:
+            self.coming, self.careful = before.coming, before.careful
+            self.failures, self.pause = before.failures, before.pause
 
-    def expect(self, frames: Iterable[Tensor | None]) -> None:
-        """These are the next ones."""
+    def expect(self, frames: Tensor | Sequence[Tensor | None]) -> None:
+        """These are the next ones. ValueError for such that are not there yet."""
+        if not isinstance(frames, Tensor | Sequence):
+            raise ValueError(f"look_ahead: expected a list or a tensor of frames, got {type(frames).__name__}")
         self.coming = deque(frames if self.gains else ())
         self.foreseen.clear()
 
     def __call__(self, frame: Tensor) -> Foreseen | None:
         """What is known of the ``frame`` whose turn it is."""
-        while self.coming and self.coming.popleft() is not frame:
+        while self.coming and not same(self.coming.popleft(), frame):
             self.foreseen.clear()
         if not self.foreseen:
             if self.pause > 0 or not self.coming:
@@ -150,9 +164,7 @@ class Lookahead:
                 break
             start = ahead(known.pose, known.velocity) if self.moving else known.pose
             found = engine_for(reference, image, settings)(reference, image, start, settings, None)
-            if found.normal is not reference.normal:
-                break
-            if self.careful and self.odd(reference, found, known.score) is not None:
+            if found.normal is not reference.normal or (self.careful and self.doubtful(found, known)):
                 break
             chain.append(Step(frame, frame._version, image, known, start, found))
             known = known._replace(pose=found.pose, velocity=found.pose - known.pose)
@@ -179,6 +191,11 @@ class Lookahead:
             if out:
                 return
             yield Foreseen(step._replace(known=step.known._replace(score=score)), Estimate(*one))
+
+    def doubtful(self, found: Solution, known: Known) -> bool:
+        """Whether what was ``found`` in a frame cannot be ordinary."""
+        moving = not float(found.error) <= self.settings.tolerance
+        return moving or self.odd(self.reference, found, known.score) is not None
 
     def odd(self, reference: Reference, found: Solution, usual: Tensor) -> Tensor | None:
         """Which of n frames have blocks that do not fit, (n,) bool, None if none has: see ``robust.unusual``."""

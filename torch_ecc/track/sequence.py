@@ -20,14 +20,13 @@ class SequenceError(ValueError):
 def tracked(
     track: Callable[[Tensor], Estimate],
     skip: Callable[[], Estimate],
-    look_ahead: Callable[[Sequence[Tensor | None]], None],
+    look_ahead: Callable[[Tensor | Sequence[Tensor | None]], None],
     frames: Iterable[Tensor | None],
     stop_at_damage: bool,
 ) -> Track:
     """What ``track`` says of each of the ``frames``, or ``skip`` of those that are damaged: see ``Tracker``."""
     estimates: list[Estimate] = []
-    frames = list(frames) if isinstance(frames, Tensor) else frames
-    if isinstance(frames, Sequence):  # else they may be one tensor, filled again and again
+    if isinstance(frames, Tensor | Sequence):  # else they may be one tensor, filled again and again
         look_ahead(frames)
     try:
         for frame in frames:

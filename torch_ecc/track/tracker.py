@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -214,7 +214,7 @@ class Tracker(nn.Module):
         self._look = Look(self.references, self.settings, self.shutter, self._buffers, moving, self.frame_mask)
         alone = len(self.start) == 1 or self.frame_shape[0] > 1
         self._crowd = None if alone else Crowd(self.start[:, :2])
-        self._ahead = Lookahead(self._look, self._viewed, self.learns)
+        self._ahead = Lookahead(self._look, self._viewed, self.learns, self.__dict__.get("_ahead"))
         sight = self.references[0].sight
         if self.learns:
             self._teacher = Teacher(self.criterion, self.settings.interpolation, self.rounds, sight and sight.shown)
@@ -370,10 +370,10 @@ class Tracker(nn.Module):
         """Same as calling the tracker."""
         return self(frame)  # type: ignore[no-any-return]
 
-    def look_ahead(self, frames: Iterable[Tensor | None]) -> None:
-        """The next ``frames``, as those of a file are known before it is their turn: one template is then tracked in
-        0.6 of the time, on a CPU. They are the tensors that the tracker will be called with, and stay as they are until
-        then; no result depends on it, and nothing is done here."""
+    def look_ahead(self, frames: Tensor | Sequence[Tensor | None]) -> None:
+        """The next ``frames`` (F, ...), as those of a file are there before it is their turn: one template is then
+        tracked in 0.6 of the time, on a CPU. They stay as they are until the tracker is called with each of them; no
+        result depends on it. Raises ValueError for such that are not there yet, as from a generator."""
         self._ahead.expect(frames)
 
     @torch.no_grad()
