@@ -146,6 +146,15 @@ def test_a_tracker_that_is_told_where_to_look_looks_there(monkeypatch: pytest.Mo
     assert steps[0] <= 2 * COUNT
 
 
+def test_frames_may_be_left_out_or_be_others():
+    """What was told of is no promise: every second frame, one twice, and some of another film."""
+    frames, others = list(FILMS["plain"]), list(film(noise=3.0))
+    came = [*frames[:9:2], frames[8], frames[8].clone(), *others[10:13], *frames[13:]]
+    here, there = tracker_of(FILMS["plain"]), tracker_of(FILMS["plain"])
+    there.look_ahead(frames)
+    assert_same(here, there, one_by_one(here, came), one_by_one(there, came))
+
+
 def test_a_frame_that_has_changed_since_is_another_one():
     """As one that is filled anew."""
     frames = [frame.clone() for frame in FILMS["plain"]]
