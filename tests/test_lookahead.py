@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pytest
@@ -224,6 +224,30 @@ def test_poses_of_frames_that_require_grad_have_theirs():
     for k in (3, 4, 6, 9):
         (slope,) = torch.autograd.grad(poses[k], frames[k])
         assert slope.abs().max() > 0
+
+
+class FromDisk(Sequence[Tensor]):
+    """Frames that are read when they are asked for."""
+
+    def __init__(self, frames: Tensor, read: list[int]) -> None:
+        self.frames, self.read = frames, read
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, k: int) -> Tensor:
+        self.read.append(k)
+        return self.frames[k]
+
+
+def test_frames_that_are_read_one_by_one_are_not_read_all_at_once():
+    """More of them than memory holds are tracked as ever."""
+    frames, read, seen = FILMS["plain"], [], []
+    tracker = tracker_of(frames)
+    track = tracker.track
+    tracker.track = lambda frame: seen.append(len(read)) or track(frame)
+    tracker.track_sequence(FromDisk(frames, read))
+    assert seen == list(range(1, COUNT + 1))
 
 
 def test_frames_that_are_not_there_are_refused():

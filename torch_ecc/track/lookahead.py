@@ -10,10 +10,10 @@ that is found depends on this.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from itertools import islice
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -36,6 +36,8 @@ MOST = 16  # frames
 DOUBLINGS = 6  # of the frames after one has looked ahead in vain, until one does so again, at fewer
 
 View = Callable[[Tensor], Tensor]
+# Frames that are there, which those of other sequences may not be before they are asked for.
+Frames: TypeAlias = "Tensor | list[Tensor] | list[Tensor | None] | tuple[Tensor | None, ...]"
 
 inference: Callable[[], bool] = torch.is_inference_mode_enabled
 
@@ -120,9 +122,9 @@ class Lookahead:
             self.coming, self.careful = before.coming, before.careful
             self.failures, self.pause = before.failures, before.pause
 
-    def expect(self, frames: Tensor | Sequence[Tensor | None]) -> None:
+    def expect(self, frames: Frames) -> None:
         """These are the next ones. ValueError for such that are not there yet."""
-        if not isinstance(frames, Tensor | Sequence):
+        if not isinstance(frames, Tensor | list | tuple):
             raise ValueError(f"look_ahead: expected a list or a tensor of frames, got {type(frames).__name__}")
         self.coming = deque(frames if self.gains else ())
         self.foreseen.clear()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 from torch import Tensor
 
 from torch_ecc.core.estimate import Estimate, Track
+from torch_ecc.track.lookahead import Frames
 
 
 class SequenceError(ValueError):
@@ -20,13 +21,13 @@ class SequenceError(ValueError):
 def tracked(
     track: Callable[[Tensor], Estimate],
     skip: Callable[[], Estimate],
-    look_ahead: Callable[[Tensor | Sequence[Tensor | None]], None],
+    look_ahead: Callable[[Frames], None],
     frames: Iterable[Tensor | None],
     stop_at_damage: bool,
 ) -> Track:
     """What ``track`` says of each of the ``frames``, or ``skip`` of those that are damaged: see ``Tracker``."""
     estimates: list[Estimate] = []
-    if isinstance(frames, Tensor | Sequence):  # else they may be one tensor, filled again and again
+    if isinstance(frames, Tensor | list | tuple):  # else they may be one tensor, filled again and again
         look_ahead(frames)
     try:
         for frame in frames:

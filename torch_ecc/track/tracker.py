@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Self
 
@@ -29,7 +29,7 @@ from torch_ecc.track.gone import searched_first
 from torch_ecc.track.lessons import Lessons, Teacher, as_rounds, begun, noise_left, renewed, told, with_new_parts
 from torch_ecc.track.light import told_of_light
 from torch_ecc.track.look import Look
-from torch_ecc.track.lookahead import Lookahead
+from torch_ecc.track.lookahead import Frames, Lookahead
 from torch_ecc.track.max_step import MaxStep
 from torch_ecc.track.recover import Recovery, from_rest
 from torch_ecc.track.sensor import dead_in, kept, shown
@@ -370,7 +370,7 @@ class Tracker(nn.Module):
         """Same as calling the tracker."""
         return self(frame)  # type: ignore[no-any-return]
 
-    def look_ahead(self, frames: Tensor | Sequence[Tensor | None]) -> None:
+    def look_ahead(self, frames: Frames) -> None:
         """The next ``frames`` (F, ...), as those of a file are there before it is their turn: one template is then
         tracked in 0.6 of the time, on a CPU. They stay as they are until the tracker is called with each of them; no
         result depends on it. Raises ValueError for such that are not there yet, as from a generator."""
